@@ -1,0 +1,1 @@
+"""Pixel tasks under one Gymnasium namespace."""

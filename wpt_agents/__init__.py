@@ -1,0 +1,1 @@
+"""WPT: generalist world-model pre-training for efficient reinforcement learning from pixels."""

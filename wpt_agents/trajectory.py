@@ -1,0 +1,152 @@
+"""A trajectory as stored, a batch as the RSSM takes it, and the one place where the two meet.
+
+The timing, once and for all. A stored trajectory is Gymnasium's: T actions, T rewards, T + 1
+images; action t was taken at image t, brought reward t and led to image t + 1::
+
+    image   o_0      o_1      o_2   ...  o_T
+    action      a_0      a_1        ...
+    reward      r_0      r_1        ...
+
+A batch pairs each image with what *led to* it, because h_t = f(h_{t-1}, z_{t-1}, a_{t-1})::
+
+    image       o_0      o_1      o_2   ...
+    action      0        a_0      a_1   ...
+    reward      0        r_0      r_1   ...
+    is_first    True     False    False ...
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+IMAGE_SIZE = 64
+STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One episode. Action t was taken at image t, brought reward t and led to image t + 1.
+
+    :param image: (T + 1, H, W, 3) uint8
+    :param action: (T, A) float32 in [-1, 1], as wide as the embodiment or padded with zeros
+    :param reward: (T,) float32, None in reward-free data
+    :param terminated: whether the last image is a terminal state (a time limit is not)
+    :param action_dim: the embodiment's true action width; A when not given
+    :param embodiment: the robot's name, when known
+    :param task: what the behaviour was after, when known
+    :param source: where the trajectory comes from, in words
+    :raises ValueError: a wrong shape or dtype, NaN or infinity, an action outside [-1, 1]
+    """
+
+    image: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray | None = None
+    terminated: bool = False
+    action_dim: int = 0
+    embodiment: str | None = None
+    task: str | None = None
+    source: str | None = None
+
+    def __post_init__(self) -> None:
+        image, action, reward = self.image, self.action, self.reward
+        if image.ndim != 4 or image.shape[-1] != 3 or image.dtype != np.uint8:
+            raise ValueError(
+                f"Trajectory.image must be (T + 1, H, W, 3) uint8, got {image.shape} {image.dtype}"
+            )
+        if action.ndim != 2 or len(action) != len(image) - 1 or len(action) == 0:
+            raise ValueError(
+                f"Trajectory.action must be (T, A) with T = {len(image) - 1} >= 1 for "
+                f"{len(image)} images, got {action.shape}"
+            )
+        if not np.isfinite(action).all() or np.abs(action).max() > 1 + 1e-5:
+            raise ValueError("Trajectory.action must be finite and in [-1, 1]; rescale it")
+        if reward is not None and (reward.shape != (len(action),) or not np.isfinite(reward).all()):
+            raise ValueError(
+                f"Trajectory.reward must be finite and of shape ({len(action)},), got "
+                f"{reward.shape}; pass None when rewards are unknown"
+            )
+        if not 0 <= self.action_dim <= action.shape[1]:
+            raise ValueError(f"action_dim {self.action_dim} exceeds the width {action.shape[1]}")
+        object.__setattr__(self, "action", np.asarray(action, np.float32))
+        object.__setattr__(self, "action_dim", self.action_dim or action.shape[1])
+        if reward is not None:
+            object.__setattr__(self, "reward", np.asarray(reward, np.float32))
+
+    def __len__(self) -> int:
+        """The number of actions, T."""
+        return len(self.action)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """(B, T) sequences as the RSSM takes them: each image with the action and reward before it.
+
+    :param image: (B, T, 64, 64, 3) uint8
+    :param action: (B, T, A) float32, what led to `image`; zeros where `is_first` and in the padding
+    :param reward: (B, T) float32, what came with `image`; 0 where unknown
+    :param is_first: (B, T) bool, where the recurrent state and the previous action are reset
+    :param is_terminal: (B, T) bool, the image is a terminal state
+    :param reward_known: (B, T) bool, where the reward head may learn
+    :param action_mask: (B, A) bool, False in the padding, taken at each sequence's first step
+    """
+
+    image: Tensor
+    action: Tensor
+    reward: Tensor
+    is_first: Tensor
+    is_terminal: Tensor
+    reward_known: Tensor
+    action_mask: Tensor
+
+    def __post_init__(self) -> None:
+        shapes = {f.name: tuple(getattr(self, f.name).shape[:2]) for f in fields(self)}
+        shapes.pop("action_mask")
+        assert len(set(shapes.values())) == 1, shapes
+
+    def to(self, device: torch.device | str) -> "Batch":
+        """The same batch on `device`."""
+        return Batch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    @staticmethod
+    def cat(batches: Sequence["Batch"]) -> "Batch":
+        """Joins batches of one length along B."""
+        return Batch(
+            **{f.name: torch.cat([getattr(b, f.name) for b in batches]) for f in fields(Batch)}
+        )
+
+
+def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[str, np.ndarray]:
+    """Images start .. stop - 1 of a trajectory, each with the action and reward that led to it.
+
+    This is the only place where actions and rewards are shifted against images.
+
+    :param width: the agent's action width, `max_action_dim`
+    :return: the streams of a Batch for one sequence: (stop - start, ...) arrays
+    """
+    length, used = len(trajectory), min(trajectory.action.shape[1], width)
+    assert 0 <= start < stop <= length + 1, (start, stop, length)
+    steps = np.arange(start, stop)
+    action = np.zeros((len(steps), width), np.float32)
+    reward = np.zeros(len(steps), np.float32)
+    later = steps > start  # the first image of a window starts a new state: nothing led to it
+    action[later, :used] = trajectory.action[steps[later] - 1, :used]
+    if trajectory.reward is not None:
+        before = steps > 0
+        reward[before] = trajectory.reward[steps[before] - 1]
+    return {
+        "image": trajectory.image[start:stop],
+        "action": action,
+        "reward": reward,
+        "is_first": ~later,
+        "is_terminal": (steps == length) & trajectory.terminated,
+        "reward_known": np.full(len(steps), trajectory.reward is not None),
+    }
+
+
+def stack_windows(windows: Sequence[dict[str, np.ndarray]], masks: np.ndarray) -> Batch:
+    """Makes a Batch of equally long windows (see `led_to`); `masks` is (B, A) bool."""
+    streams = {k: torch.from_numpy(np.stack([w[k] for w in windows])) for k in STREAMS}
+    return Batch(**streams, action_mask=torch.from_numpy(masks))

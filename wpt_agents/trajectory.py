@@ -90,7 +90,6 @@ class Batch:
     :param is_first: (B, T) bool, where the recurrent state and the previous action are reset
     :param is_terminal: (B, T) bool, the image is a terminal state
     :param reward_known: (B, T) bool, where the reward head may learn
-    :param action_mask: (B, A) bool, False in the padding, taken at each sequence's first step
     """
 
     image: Tensor
@@ -99,11 +98,9 @@ class Batch:
     is_first: Tensor
     is_terminal: Tensor
     reward_known: Tensor
-    action_mask: Tensor
 
     def __post_init__(self) -> None:
         shapes = {f.name: tuple(getattr(self, f.name).shape[:2]) for f in fields(self)}
-        shapes.pop("action_mask")
         assert len(set(shapes.values())) == 1, shapes
 
     def to(self, device: torch.device | str) -> "Batch":
@@ -123,11 +120,13 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
 
     This is the only place where actions and rewards are shifted against images.
 
-    :param width: the agent's action width, `max_action_dim`
+    :param width: the agent's action width, `max_action_dim`; entries past the embodiment's own
+        `action_dim` are zero, whatever the trajectory holds there
     :return: the streams of a Batch for one sequence: (stop - start, ...) arrays
     """
-    length, used = len(trajectory), min(trajectory.action.shape[1], width)
+    length, used = len(trajectory), trajectory.action_dim
     assert 0 <= start < stop <= length + 1, (start, stop, length)
+    assert used <= width, (used, width)
     steps = np.arange(start, stop)
     action = np.zeros((len(steps), width), np.float32)
     reward = np.zeros(len(steps), np.float32)
@@ -146,7 +145,6 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
     }
 
 
-def stack_windows(windows: Sequence[dict[str, np.ndarray]], masks: np.ndarray) -> Batch:
-    """Makes a Batch of equally long windows (see `led_to`); `masks` is (B, A) bool."""
-    streams = {k: torch.from_numpy(np.stack([w[k] for w in windows])) for k in STREAMS}
-    return Batch(**streams, action_mask=torch.from_numpy(masks))
+def stack_windows(windows: Sequence[dict[str, np.ndarray]]) -> Batch:
+    """Makes a Batch of equally long windows (see `led_to`)."""
+    return Batch(**{k: torch.from_numpy(np.stack([w[k] for w in windows])) for k in STREAMS})

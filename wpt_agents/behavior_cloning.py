@@ -1,0 +1,58 @@
+"""The prior actor: a behaviour clone of the retrieved trajectories (A.3, Algorithm 1)."""
+
+import torch
+from torch import Generator, Tensor, nn
+
+from wpt_agents.networks import Encoder, LinearNorm, Size
+
+FRAMES = 3  # what one image does not show, such as velocities, three do
+
+
+def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
+    """-log π_bc(a | o) of a Gaussian of fixed variance, up to constants: the squared error.
+
+    :param prediction: (N, A), the Gaussian's mean
+    :param action: (N, A), taken at the observation
+    :param mask: (A,) bool, True at the embodiment's own entries; the others count nothing
+    """
+    assert prediction.shape == action.shape, (prediction.shape, action.shape)
+    return ((prediction - action).square() * mask).sum() / (mask.sum() * len(action))
+
+
+def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:
+    """Moves each stack of frames by up to `pad` pixels, repeating the border.
+
+    :param image: (N, F, H, W, C)
+    """
+    n, _, height, width, _ = image.shape
+    shift = torch.randint(-pad, pad + 1, (n, 2), device=image.device, generator=generator)
+    rows = (torch.arange(height, device=image.device) + shift[:, :1]).clamp(0, height - 1)
+    columns = (torch.arange(width, device=image.device) + shift[:, 1:]).clamp(0, width - 1)
+    which = torch.arange(n, device=image.device)[:, None, None]
+    moved = image.transpose(1, 2).transpose(2, 3)  # (N, H, W, F, C): one index does all frames
+    return moved[which, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2, 4)
+
+
+class PriorActor(nn.Module):
+    """π_bc(a | o): its own encoder over three stacked frames, then an MLP.
+
+    :param size: the widths; its own are half as deep
+    :param action_dim: the padded action width, A
+    """
+
+    def __init__(self, size: Size, action_dim: int) -> None:
+        super().__init__()
+        self.encoder = Encoder(max(size.depth // 2, 8), 3 * FRAMES)
+        self.layers = nn.Sequential(
+            LinearNorm(self.encoder.embed_dim, size.units),
+            LinearNorm(size.units, size.units),
+            nn.Linear(size.units, action_dim),
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8, oldest first -> (N, A), not clipped."""
+        return self.layers(self.encoder(image.permute(0, 2, 3, 1, 4).flatten(-2)))
+
+    def act(self, image: Tensor, mask: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1], zero in the padding."""
+        return self(image).clamp(-1, 1) * mask

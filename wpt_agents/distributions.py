@@ -1,0 +1,140 @@
+"""The three distributions: one-hot latents, two-hot returns, truncated-normal actions."""
+
+import math
+
+import torch
+from torch import Generator, Tensor
+
+BINS = 255  # of the two-hot heads, evenly spaced over [-20, 20] in symlog space
+SQRT2 = math.sqrt(2.0)
+
+
+def symlog(x: Tensor) -> Tensor:
+    """sign(x) ln(|x| + 1): squeezes rewards and returns of any scale."""
+    return torch.sign(x) * torch.log1p(x.abs())
+
+
+def symexp(x: Tensor) -> Tensor:
+    """The inverse of symlog."""
+    return torch.sign(x) * torch.expm1(x.abs())
+
+
+def two_hot(x: Tensor, bins: int = BINS) -> Tensor:
+    """symlog(x) as weights on the two nearest bins.
+
+    :param x: (...), any real number; beyond symexp(20) it is clipped
+    :return: (..., bins), at most two entries are not zero, the sum is 1
+    """
+    position = (symlog(x).clamp(-20, 20) + 20) * (bins - 1) / 40
+    below = position.floor().clamp(max=bins - 2)
+    upper = (position - below).unsqueeze(-1)
+    index = below.long().unsqueeze(-1)
+    weights = torch.zeros(*x.shape, bins, device=x.device, dtype=position.dtype)
+    return weights.scatter_(-1, index, 1 - upper).scatter_(-1, index + 1, upper)
+
+
+def two_hot_mean(logits: Tensor) -> Tensor:
+    """The mean bin, through symexp: (..., bins) logits -> (...)."""
+    logits = logits.float()
+    bins = torch.linspace(-20, 20, logits.shape[-1], device=logits.device)
+    return symexp(logits.softmax(-1) @ bins)
+
+
+def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """-ln p(target): cross entropy with the two-hot target.
+
+    :param logits: (..., bins)
+    :param target: (...), in the target's own units
+    :return: (...)
+    """
+    logits = logits.float()
+    return -(two_hot(target, logits.shape[-1]) * logits.log_softmax(-1)).sum(-1)
+
+
+def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:
+    """Log-probabilities of 99 % softmax and 1 % uniform: no class ever has probability zero.
+
+    :param logits: (..., K)
+    """
+    probs = logits.float().softmax(-1)
+    return torch.log((1 - unimix) * probs + unimix / logits.shape[-1])
+
+
+def sample_one_hot(logits: Tensor, generator: Generator | None = None) -> Tensor:
+    """A one-hot sample whose gradient is that of the probabilities (straight-through).
+
+    :param logits: (..., K) log-probabilities
+    :return: (..., K)
+    """
+    probs = logits.exp()
+    # the largest of p_k / E_k, E_k ~ Exp(1), is class k with probability p_k
+    race = torch.empty_like(probs).exponential_(generator=generator)
+    return _straight_through(probs, (probs.detach() / race).argmax(-1))
+
+
+def mode_one_hot(logits: Tensor) -> Tensor:
+    """The likeliest class, one-hot and straight-through: (..., K) -> (..., K)."""
+    return _straight_through(logits.exp(), logits.argmax(-1))
+
+
+def _straight_through(probs: Tensor, index: Tensor) -> Tensor:
+    one_hot = torch.zeros_like(probs).scatter_(-1, index.unsqueeze(-1), 1.0)
+    return one_hot + (probs - probs.detach())
+
+
+def kl_one_hot(left: Tensor, right: Tensor) -> Tensor:
+    """KL(left || right), summed over the groups.
+
+    :param left: (..., S, K) log-probabilities
+    :param right: (..., S, K) log-probabilities
+    :return: (...)
+    """
+    return (left.exp() * (left - right)).sum((-1, -2))
+
+
+class TruncatedNormal:
+    """Independent normals cut to [-1, 1], the padded entries left out.
+
+    :param mean: (..., A), in [-1, 1]
+    :param std: (..., A), positive
+    :param mask: (..., A) bool, broadcast; where False a sample is 0 and nothing is counted
+    """
+
+    def __init__(self, mean: Tensor, std: Tensor, mask: Tensor) -> None:
+        self.mean, self.std, self.mask = mean.float(), std.float(), mask
+        self.low = (-1 - self.mean) / self.std
+        self.high = (1 - self.mean) / self.std
+        self.low_cdf, high_cdf = _cdf(self.low), _cdf(self.high)
+        self.mass = (high_cdf - self.low_cdf).clamp_min(1e-6)
+
+    @property
+    def mode(self) -> Tensor:
+        """(..., A): the mean of the uncut normal, which lies inside."""
+        return self.mean * self.mask
+
+    def rsample(self, generator: Generator | None = None) -> Tensor:
+        """(..., A): a sample by the inverse cumulative, differentiable in mean and std."""
+        uniform = torch.rand(self.mean.shape, device=self.mean.device, generator=generator)
+        cdf = self.low_cdf + uniform * self.mass
+        z = SQRT2 * torch.erfinv((2 * cdf - 1).clamp(-1 + 1e-6, 1 - 1e-6))
+        return (self.mean + self.std * z).clamp(-1, 1) * self.mask
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """(..., A) -> (...), summed over the true entries."""
+        z = (action - self.mean) / self.std
+        log_prob = -0.5 * z * z - self.std.log() - 0.5 * math.log(2 * math.pi) - self.mass.log()
+        return (log_prob * self.mask).sum(-1)
+
+    def entropy(self) -> Tensor:
+        """(...): exact, summed over the true entries."""
+        tails = (self.low * _pdf(self.low) - self.high * _pdf(self.high)) / (2 * self.mass)
+        constant = 0.5 * math.log(2 * math.pi * math.e)
+        return ((constant + self.std.log() + self.mass.log() + tails) * self.mask).sum(-1)
+
+
+def _cdf(z: Tensor) -> Tensor:
+    return 0.5 * (1 + torch.erf(z / SQRT2))
+
+
+def _pdf(z: Tensor) -> Tensor:
+    return torch.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)

@@ -1,0 +1,55 @@
+"""Execution guidance: how often, and for which steps of an episode, the prior actor drives."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+
+Schedule = Callable[[int], float]
+SHARES = np.arange(1, 11) / 10  # a window lasts 10 %, 20 %, ... or 100 % of the episode
+
+
+def linear(start: float, end: float, duration: float) -> Schedule:
+    """From `start` to `end` over `duration` steps, constant afterwards.
+
+    The unit is the agent's step, a call of `env.step`: linear(1, 0, 50000) ends after 100,000
+    frames at action repeat 2.
+    """
+    return lambda step: start + (end - start) * min(max(step / duration, 0.0), 1.0)
+
+
+def parse_schedule(text: str | float) -> Schedule:
+    """'linear(1,0,50000)' or a constant -> the schedule.
+
+    :raises ValueError: anything else
+    """
+    number = r"([-+0-9.eE_]+)"
+    match = re.fullmatch(rf"linear\({number},{number},{number}\)", str(text).replace(" ", ""))
+    try:
+        if match:
+            start, end, duration = (float(group) for group in match.groups())
+            if duration > 0:
+                return linear(start, end, duration)
+        else:
+            constant = float(text)
+            return lambda step: constant
+    except ValueError:
+        pass
+    raise ValueError(
+        f"Schedule {text!r} is not understood: write a number, or 'linear(start,end,steps)' "
+        "with steps > 0, for example 'linear(1,0,50000)'"
+    )
+
+
+def draw_window(probability: float, length: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Once an episode: the steps k .. k + H - 1 at which the prior actor drives.
+
+    :param probability: of guiding this episode at all
+    :param length: steps an episode lasts
+    :return: (k, k + H), half-open; (0, 0) when it does not drive
+    """
+    if rng.random() >= probability:
+        return 0, 0
+    duration = max(1, round(rng.choice(SHARES) * length))
+    start = int(rng.integers(0, length - duration + 1))
+    return start, start + duration

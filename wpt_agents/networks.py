@@ -1,0 +1,218 @@
+"""Building blocks: sizes, the convolutional encoder and decoder, MLPs, block-linear layers."""
+
+import itertools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+NORM_EPS = 1e-3
+
+
+@dataclass(frozen=True)
+class Size:
+    """The widths of all networks and the learning rates that suit them.
+
+    :param deter: width of h
+    :param hidden: width inside the RSSM
+    :param stoch: groups of z
+    :param classes: classes in a group of z
+    :param depth: channels of the first convolution
+    :param units: width of the heads: actor, critic, reward
+    :param learning_rate: of world model and reward head
+    :param actor_critic_learning_rate: of actor and critic
+    """
+
+    deter: int
+    hidden: int
+    stoch: int
+    classes: int
+    depth: int
+    units: int
+    learning_rate: float = 1e-4
+    actor_critic_learning_rate: float = 8e-5
+    blocks: int = 8
+
+
+# `paper`: Table 2 prints 12288 as hidden and 1536 as deterministic; only the other way round does
+# the world model count the 280 M parameters of the text (tests/test_world_model.py counts them).
+SIZES = {
+    "debug": Size(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
+    "tiny": Size(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
+    "small": Size(256, 128, 16, 16, 16, 256, 6e-4, 3e-4),
+    "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
+    "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5),
+}
+
+
+class ChannelNorm(nn.LayerNorm):
+    """Layer norm over the channels of (N, C, H, W)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels, eps=NORM_EPS)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) -> (N, C, H, W)."""
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class BlockLinear(nn.Module):
+    """A linear layer whose weight is block-diagonal: `blocks` times (inputs/b -> outputs/b).
+
+    The fan-in of a unit is its block's width, and the weights are drawn accordingly.
+    """
+
+    def __init__(self, inputs: int, outputs: int, blocks: int) -> None:
+        super().__init__()
+        assert inputs % blocks == outputs % blocks == 0, (inputs, outputs, blocks)
+        self.weight = nn.Parameter(torch.empty(blocks, inputs // blocks, outputs // blocks))
+        self.bias = nn.Parameter(torch.empty(outputs))
+        bound = 1 / math.sqrt(inputs // blocks)
+        nn.init.uniform_(self.weight, -bound, bound)
+        nn.init.uniform_(self.bias, -bound, bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs) -> (N, outputs)."""
+        blocks = x.reshape(len(x), len(self.weight), -1).transpose(0, 1)
+        bias = self.bias.view(len(self.weight), 1, -1)
+        return torch.baddbmm(bias, blocks, self.weight).transpose(0, 1).flatten(1)
+
+
+class LinearNorm(nn.Sequential):
+    """Linear, layer norm, SiLU."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(nn.Linear(inputs, outputs), nn.LayerNorm(outputs, eps=NORM_EPS), nn.SiLU())
+
+
+class Encoder(nn.Module):
+    """e(o): four strided convolutions, 64 > 31 > 14 > 6 > 2, flattened.
+
+    :param depth: channels of the first layer, doubled in each that follows
+    :param channels_in: 3 for one image, 3 F for F stacked ones
+    """
+
+    def __init__(self, depth: int, channels_in: int = 3) -> None:
+        super().__init__()
+        channels = (channels_in, depth, 2 * depth, 4 * depth, 8 * depth)
+        layers: list[nn.Module] = []
+        for inputs, outputs in itertools.pairwise(channels):
+            layers += [nn.Conv2d(inputs, outputs, 4, 2), ChannelNorm(outputs), nn.SiLU()]
+        self.layers = nn.Sequential(*layers)
+        self.embed_dim = 8 * depth * 2 * 2
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(..., 64, 64, channels_in) uint8 -> (..., E)."""
+        assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
+        x = to_unit(image).flatten(0, -4).permute(0, 3, 1, 2)  # channels_last in memory
+        return self.layers(x).flatten(1).unflatten(0, image.shape[:-3])
+
+
+class UpConv(nn.ConvTranspose2d):
+    """A transposed convolution of stride 2, computed as one 3x3 convolution and a pixel shuffle.
+
+    An output pixel (2i + p, 2j + q) sees the kernel's entries of parity (p, q) only, so the four
+    parities are four ordinary convolutions of the input, here done at once. Exactly the same sums.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
+        super().__init__(inputs, outputs, kernel, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+        inputs, outputs, kernel, _ = self.weight.shape
+        weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
+        phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(1, 3, 5, 0, 2, 4).flip(-1, -2)
+        bias = self.bias.repeat_interleave(4)
+        out = F.conv2d(x, phases.reshape(4 * outputs, inputs, 3, 3), bias, padding=2)
+        size = 2 * x.shape[-1] + kernel - 2
+        return F.pixel_shuffle(out, 2)[..., :size, :size]
+
+
+class Decoder(nn.Module):
+    """The mean of p(o | h, z): two MLPs summed, then 1 > 5 > 13 > 30 > 64; no squashing."""
+
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        width, code, depth = 2 * size.hidden, 32 * size.depth, size.depth
+        self.from_deter = nn.Sequential(
+            BlockLinear(size.deter, width, size.blocks),
+            nn.LayerNorm(width, eps=NORM_EPS),
+            nn.SiLU(),
+            nn.Linear(width, code),
+        )
+        self.from_stoch = nn.Sequential(
+            LinearNorm(size.stoch * size.classes, width), nn.Linear(width, code)
+        )
+        self.layers = nn.Sequential(
+            nn.ConvTranspose2d(code, 4 * depth, 5, 2),
+            ChannelNorm(4 * depth),
+            nn.SiLU(),
+            nn.ConvTranspose2d(4 * depth, 2 * depth, 5, 2),
+            ChannelNorm(2 * depth),
+            nn.SiLU(),
+            UpConv(2 * depth, depth, 6),
+            ChannelNorm(depth),
+            nn.SiLU(),
+            UpConv(depth, 3, 6),
+        )
+
+    def forward(self, deter: Tensor, stoch: Tensor) -> Tensor:
+        """(N, D), (N, S, K) -> (N, 64, 64, 3), about -0.5 .. 0.5."""
+        code = self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
+        return self.layers(code[..., None, None]).permute(0, 2, 3, 1)
+
+
+class Head(nn.Module):
+    """An MLP over s = [h, z]: the two parts enter by a sum, then `layers` hidden layers."""
+
+    def __init__(self, size: Size, layers: int, outputs: int, zero_init: bool = False) -> None:
+        super().__init__()
+        width = 2 * size.units
+        self.from_deter = nn.Sequential(
+            BlockLinear(size.deter, width, size.blocks),
+            nn.LayerNorm(width, eps=NORM_EPS),
+            nn.SiLU(),
+            nn.Linear(width, size.units),
+        )
+        self.from_stoch = nn.Linear(size.stoch * size.classes, size.units)
+        hidden = [LinearNorm(size.units, size.units) for _ in range(layers)]
+        self.layers = nn.Sequential(*hidden, nn.Linear(size.units, outputs))
+        self.deter_dim = size.deter
+        if zero_init:
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.zeros_(self.layers[-1].bias)
+
+    def forward(self, feat: Tensor) -> Tensor:
+        """(..., D + S*K) -> (..., outputs)."""
+        flat = feat.reshape(-1, feat.shape[-1])
+        deter, stoch = flat[:, : self.deter_dim], flat[:, self.deter_dim :]
+        out = self.layers(self.from_deter(deter) + self.from_stoch(stoch))
+        return out.unflatten(0, feat.shape[:-1])
+
+
+def to_unit(image: Tensor) -> Tensor:
+    """uint8 pixels -> float32 in [-0.5, 0.5]."""
+    return image.float() / 255 - 0.5
+
+
+def to_uint8(image: Tensor) -> Tensor:
+    """The inverse of `to_unit`, rounded and clipped."""
+    return ((image + 0.5) * 255).round().clamp(0, 255).to(torch.uint8)
+
+
+@contextmanager
+def frozen(*modules: nn.Module) -> Iterator[None]:
+    """Gradients pass through these modules and leave their parameters alone."""
+    parameters = [p for m in modules for p in m.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)

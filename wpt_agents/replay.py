@@ -7,18 +7,15 @@ Example::
     batch = replay.sample(16, 64, action_width=12, rng=np.random.default_rng(0))
 """
 
-import json
 import os
-import zipfile
-from io import BytesIO
 
 import numpy as np
 
-from wpt_agents.atomic import replacing
+from wpt_agents.archive import load_arrays, save_arrays
 from wpt_agents.trajectory import Batch, Trajectory
 from wpt_agents.windows import Row, Windows, make_batch
 
-FORMAT, VERSION = "wpt_agents.ReplayBuffer", 1
+ARRAYS = ("image", "action", "reward")
 LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 
 
@@ -66,53 +63,33 @@ class ReplayBuffer:
         if not self.trajectories:
             raise ValueError("The replay buffer is empty; add a trajectory before sampling")
         if self._windows is None:
-            lengths = np.array([len(t) for t in self.trajectories])
-            self._windows = Windows(lengths, np.array([t.action_dim for t in self.trajectories]))
+            self._windows = Windows(np.array([len(t) for t in self.trajectories]))
         rows = self._windows.draw(batch_size, length, rng)
         return [[(self.trajectories[i], start, stop) for i, start, stop in row] for row in rows]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one file (a zip of arrays and JSON, no pickle), whole or not at all."""
+        """Writes one file (arrays and JSON, no pickle), whole or not at all."""
         episodes = [{k: getattr(t, k) for k in LABELS} for t in self.trajectories]
-        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-            for i, trajectory in enumerate(self.trajectories):
-                for name in ("image", "action", "reward"):
-                    if (array := getattr(trajectory, name)) is not None:
-                        with archive.open(f"{i}/{name}.npy", "w", force_zip64=True) as member:
-                            np.lib.format.write_array(member, array, allow_pickle=False)
-            about = {"format": FORMAT, "version": VERSION, "episodes": episodes}
-            archive.writestr("replay.json", json.dumps(about))
+        arrays = {
+            f"{i}/{name}": getattr(trajectory, name)
+            for i, trajectory in enumerate(self.trajectories)
+            for name in ARRAYS
+            if getattr(trajectory, name) is not None
+        }
+        save_arrays(path, "ReplayBuffer", {"episodes": episodes}, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ReplayBuffer":
-        """Reads what `save` wrote; every byte is checked.
+        """Reads what `save` wrote.
 
         :raises ValueError: a file that is cut short, damaged, or not a replay buffer
         """
+        about, arrays = load_arrays(path, "ReplayBuffer")
         replay = cls()
-        try:
-            with zipfile.ZipFile(path) as archive:
-                about = json.loads(archive.read("replay.json"))
-                if about.get("format") != FORMAT or about["version"] > VERSION:
-                    raise ValueError(f"format {about.get('format')} version {about.get('version')}")
-                names = set(archive.namelist())
-                for i, labels in enumerate(about["episodes"]):
-                    arrays = {
-                        name: _array(archive.read(f"{i}/{name}.npy"))
-                        for name in ("image", "action", "reward")
-                        if f"{i}/{name}.npy" in names
-                    }
-                    replay.add(Trajectory(**arrays, **labels))
-        except (zipfile.BadZipFile, KeyError, EOFError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{path} is not a replay buffer of this version, or is damaged ({error}); "
-                "save it again"
-            ) from error
+        for i, labels in enumerate(about["episodes"]):
+            streams = {n: arrays[f"{i}/{n}"] for n in ARRAYS if f"{i}/{n}" in arrays}
+            replay.add(Trajectory(**streams, **labels))
         return replay
-
-
-def _array(content: bytes) -> np.ndarray:
-    return np.lib.format.read_array(BytesIO(content), allow_pickle=False)
 
 
 def mix(

@@ -2,8 +2,8 @@
 
 A window is `length` images in a row, and each window of each trajectory is equally likely. A
 trajectory with fewer images counts as one window: it is taken whole and chained, the window goes on
-with further trajectories from their first image, drawn uniformly among those of the same action
-width, with `is_first` True at each joint. So no trajectory vanishes because it is short.
+with further trajectories from their first image, drawn uniformly, with `is_first` True at each
+joint. So no trajectory vanishes because it is short.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,18 +19,15 @@ Row = list[tuple[Trajectory, int, int]]  # the pieces that make one sequence
 
 
 class Windows:
-    """Draws windows from trajectories of known lengths and widths.
+    """Draws windows from trajectories of known lengths.
 
     :param lengths: (N,) int, the number of actions of each trajectory (it has one image more)
-    :param action_dims: (N,) int
     """
 
-    def __init__(self, lengths: np.ndarray, action_dims: np.ndarray) -> None:
-        assert len(lengths) == len(action_dims) > 0, (len(lengths), len(action_dims))
+    def __init__(self, lengths: np.ndarray) -> None:
+        assert len(lengths) > 0
         self._images = np.asarray(lengths, np.int64) + 1
-        self._dims = np.asarray(action_dims)
         self._ends: dict[int, np.ndarray] = {}  # window length -> (N,) cumulative counts
-        self._same_width: dict[int, np.ndarray] = {}  # action width -> indices
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[list[Piece]]:
         """The pieces of `batch_size` windows: of one, or of several if trajectories are short."""
@@ -46,13 +43,10 @@ class Windows:
         ]
 
     def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> list[Piece]:
-        width = int(self._dims[i])
         pieces = [(i, start, int(min(start + length, self._images[i])))]
         missing = length - (pieces[0][2] - start)
         while missing > 0:
-            if width not in self._same_width:
-                self._same_width[width] = np.flatnonzero(self._dims == width)
-            i = int(rng.choice(self._same_width[width]))
+            i = int(rng.integers(len(self._images)))
             pieces.append((i, 0, int(min(missing, self._images[i]))))
             missing -= pieces[-1][2]
         return pieces
@@ -80,7 +74,6 @@ def make_batch(
             for name, stream in streams.items():
                 out[name][b, at : at + stop - start] = stream
             at += stop - start
-        out["action_mask"][b] = np.arange(width) < rows[b][0][0].action_dim
 
     for _ in each(fill, range(len(rows))):
         pass
@@ -95,7 +88,6 @@ def _empty(size: int, length: int, image: tuple[int, ...], width: int) -> dict[s
         "is_first": np.empty((size, length), bool),
         "is_terminal": np.empty((size, length), bool),
         "reward_known": np.empty((size, length), bool),
-        "action_mask": np.empty((size, width), bool),
     }
 
 

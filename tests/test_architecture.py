@@ -1,0 +1,108 @@
+"""The layers: each module imports only from those above it, and nobody imports the package root."""
+
+import ast
+import re
+import sys
+import tomllib
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = [
+    {"trajectory", "distributions", "networks", "guidance", "archive"},
+    {"windows"},
+    {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
+    {"retrieval", "world_model"},
+    {"policy"},
+    {"wpt"},
+    {"zoo"},
+]
+
+
+def modules(package):
+    """Each module's dotted name and path, tests and presets apart."""
+    folder = {"wpt_agents": ROOT / "wpt_agents", "wpt_envs": ROOT / "envs" / "wpt_envs"}[package]
+    paths = sorted(folder.rglob("*.py"))
+    parts = [path.relative_to(folder.parent).with_suffix("").parts for path in paths]
+    return [(".".join(p).removesuffix(".__init__"), f) for p, f in zip(parts, paths, strict=True)]
+
+
+def imports(name, path):
+    """Every module that `path` imports anywhere, in functions and type checks too."""
+    package = name.split(".") if path.stem == "__init__" else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join(base + ([node.module] if node.module else []))
+            yield source
+            yield from (f"{source}.{alias.name}" for alias in node.names)
+
+
+def within(package):
+    """The imports of each module of `package` that stay inside it."""
+    names = {name for name, _ in modules(package)}
+    return {n: {i for i in imports(n, p) if i in names - {n}} for n, p in modules(package)}
+
+
+def layer(module):
+    part = module.removeprefix("wpt_agents.").split(".")[0]
+    found = [i for i, layer in enumerate(LAYERS) if part in layer]
+    assert found, f"{module} stands in no layer: give it one in LAYERS, and say so in DESIGN"
+    return found[0]
+
+
+AGENT = [n for n, _ in modules("wpt_agents") if n != "wpt_agents"]
+
+
+@pytest.mark.parametrize("module", AGENT)
+def test_each_module_imports_only_from_the_layers_above_it(module):
+    below = {i for i in within("wpt_agents")[module] - {"wpt_agents"} if layer(i) > layer(module)}
+    assert not below
+
+
+@pytest.mark.parametrize("package", ["wpt_agents", "wpt_envs"])
+def test_no_module_imports_itself_through_others_not_even_lazily(package):
+    graph = {n: {i for i in found if i != package} for n, found in within(package).items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError with the cycle
+
+
+@pytest.mark.parametrize("module", AGENT)
+def test_nobody_inside_imports_the_package_root(module):
+    path = dict(modules("wpt_agents"))[module]
+    roots = [
+        node
+        for node in ast.walk(ast.parse(path.read_text()))
+        if (isinstance(node, ast.ImportFrom) and node.module == "wpt_agents")
+        or (isinstance(node, ast.Import) and "wpt_agents" in [a.name for a in node.names])
+    ]
+    assert not roots
+
+
+@pytest.mark.parametrize(("module", "path"), modules("wpt_envs"))
+def test_the_tasks_know_neither_torch_nor_the_agent(module, path):
+    assert not {i.split(".")[0] for i in imports(module, path)} & {"torch", "wpt_agents"}
+
+
+def test_only_the_zoo_knows_both_agent_and_tasks():
+    knows = {n for n, p in modules("wpt_agents") if any("wpt_envs" in i for i in imports(n, p))}
+    assert all(name.startswith("wpt_agents.zoo") for name in knows)
+
+
+def test_the_reader_of_imports_sees_lazy_and_relative_ones(tmp_path):
+    path = tmp_path / "rssm.py"
+    path.write_text("def f():\n    from .wpt import WPT\n    import wpt_agents.zoo\n")
+    found = set(imports("wpt_agents.rssm", path))
+    assert {"wpt_agents.wpt", "wpt_agents.zoo"} <= found
+
+
+def test_every_third_party_import_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.split("[<>=]", d)[0].replace("-", "_") for d in project["dependencies"]}
+    declared |= {"faiss", "yaml", "mujoco"}  # faiss-cpu, pyyaml, and what metaworld pins
+    inside = {"wpt_agents", "wpt_envs", ""} | set(sys.stdlib_module_names)
+    every = [i for p in ("wpt_agents", "wpt_envs") for m in modules(p) for i in imports(*m)]
+    assert {i.split(".")[0] for i in every} - inside <= declared

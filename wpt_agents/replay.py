@@ -13,7 +13,7 @@ import numpy as np
 
 from wpt_agents.archive import load_arrays, save_arrays
 from wpt_agents.trajectory import Batch, Trajectory
-from wpt_agents.windows import Row, Windows, make_batch
+from wpt_agents.windows import Piece, Row, Windows, make_batch
 
 ARRAYS = ("image", "action", "reward")
 LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
@@ -56,16 +56,16 @@ class ReplayBuffer:
 
         :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
         """
-        return make_batch(self.draw(batch_size, length, rng), action_width)
+        rows = self.draw(batch_size, length, rng)
+        return _batch_of(self.trajectories, rows, action_width)
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
-        """The pieces `sample` would copy."""
+        """Which pieces `sample` would copy."""
         if not self.trajectories:
             raise ValueError("The replay buffer is empty; add a trajectory before sampling")
         if self._windows is None:
             self._windows = Windows(np.array([len(t) for t in self.trajectories]))
-        rows = self._windows.draw(batch_size, length, rng)
-        return [[(self.trajectories[i], start, stop) for i, start, stop in row] for row in rows]
+        return self._windows.draw(batch_size, length, rng)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file (arrays and JSON, no pickle), whole or not at all."""
@@ -108,10 +108,23 @@ def mix(
     if not 0 <= ratio <= 1:
         raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")
     others = round(batch_size * ratio) if retrieved else 0
-    rows = online.draw(batch_size - others, length, rng) if others < batch_size else []
+    trajectories, rows = online.trajectories, []
+    if others < batch_size:
+        rows = online.draw(batch_size - others, length, rng)
     if retrieved and others:
-        rows = rows + retrieved.draw(others, length, rng)
-    batch = make_batch(rows, action_width)
+        behind = len(trajectories)
+        trajectories = trajectories + retrieved.trajectories
+        drawn = retrieved.draw(others, length, rng)
+        rows += [[(behind + i, start, stop) for i, start, stop in row] for row in drawn]
+    batch = _batch_of(trajectories, rows, action_width)
     batch.reward[batch_size - others :] = 0
     batch.reward_known[batch_size - others :] = False
     return batch
+
+
+def _batch_of(trajectories: list[Trajectory], rows: list[Row], width: int) -> Batch:
+    def read(piece: Piece) -> tuple[Trajectory, int, int]:
+        i, start, stop = piece
+        return trajectories[i], start, stop
+
+    return make_batch(rows, read, trajectories[0].image.shape[1:], width)

@@ -9,15 +9,12 @@ Example::
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch  # noqa: F401  # before faiss: the other way round crashes on some builds
 
 from wpt_agents.archive import load_arrays, save_arrays
-
-if TYPE_CHECKING:
-    from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.dataset import TrajectoryDataset
 
 CHUNK = 4096
 
@@ -49,7 +46,7 @@ class Retriever:
     @classmethod
     def build(
         cls,
-        dataset: "TrajectoryDataset",
+        dataset: TrajectoryDataset,
         embed: Callable[[np.ndarray], np.ndarray],
         encoder_id: str,
         progress_bar: bool = False,

@@ -15,7 +15,7 @@ import torch
 from wpt_agents.trajectory import Batch, Trajectory, led_to
 
 Piece = tuple[int, int, int]  # trajectory, its first image, one past its last image
-Row = list[tuple[Trajectory, int, int]]  # the pieces that make one sequence
+Row = list[Piece]  # the pieces that make one sequence
 
 
 class Windows:
@@ -29,7 +29,7 @@ class Windows:
         self._images = np.asarray(lengths, np.int64) + 1
         self._ends: dict[int, np.ndarray] = {}  # window length -> (N,) cumulative counts
 
-    def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[list[Piece]]:
+    def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
         """The pieces of `batch_size` windows: of one, or of several if trajectories are short."""
         if length not in self._ends:
             self._ends = {length: np.cumsum(np.maximum(self._images - length + 1, 1))}
@@ -42,7 +42,7 @@ class Windows:
             for i, start in zip(chosen, starts, strict=True)
         ]
 
-    def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> list[Piece]:
+    def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> Row:
         pieces = [(i, start, int(min(start + length, self._images[i])))]
         missing = length - (pieces[0][2] - start)
         while missing > 0:
@@ -54,24 +54,28 @@ class Windows:
 
 def make_batch(
     rows: Sequence[Row],
+    read: Callable[[Piece], tuple[Trajectory, int, int]],
+    image_shape: tuple[int, ...],
     width: int,
     each: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
 ) -> Batch:
     """Copies the pieces of each row, one after the other, into a fresh Batch.
 
+    :param read: where a piece is: a trajectory, or a part of one, and the images to take of it
+    :param image_shape: (H, W, 3)
     :param width: the agent's action width, `max_action_dim`
-    :param each: `map`, or a thread pool's, when slicing `image` costs time
+    :param each: `map`, or a thread pool's if `read` takes time
     :raises ValueError: a trajectory with more actions than `width`
     """
     length = sum(stop - start for _, start, stop in rows[0])
-    out = _empty(len(rows), length, rows[0][0][0].image.shape[1:], width)
+    out = _empty(len(rows), length, image_shape, width)
 
     def fill(b: int) -> None:
         at = 0
-        for trajectory, start, stop in rows[b]:
+        for piece in rows[b]:
+            trajectory, start, stop = read(piece)
             _check_width(trajectory, width)
-            streams = led_to(trajectory, start, stop, width)
-            for name, stream in streams.items():
+            for name, stream in led_to(trajectory, start, stop, width).items():
                 out[name][b, at : at + stop - start] = stream
             at += stop - start
 
@@ -80,9 +84,11 @@ def make_batch(
     return Batch(**{name: torch.from_numpy(array) for name, array in out.items()})
 
 
-def _empty(size: int, length: int, image: tuple[int, ...], width: int) -> dict[str, np.ndarray]:
+def _empty(
+    size: int, length: int, image_shape: tuple[int, ...], width: int
+) -> dict[str, np.ndarray]:
     return {
-        "image": np.empty((size, length, *image), np.uint8),
+        "image": np.empty((size, length, *image_shape), np.uint8),
         "action": np.empty((size, length, width), np.float32),
         "reward": np.empty((size, length), np.float32),
         "is_first": np.empty((size, length), bool),

@@ -1,0 +1,292 @@
+"""D_off, the non-curated offline data: trajectories in a folder, read lazily.
+
+Example::
+
+    with TrajectoryDataset.create("walker") as dataset:
+        dataset.append(Trajectory(image, action, embodiment="walker"))
+    dataset = TrajectoryDataset.open("walker")
+    batch = dataset.sample(16, 64, action_width=12, rng=np.random.default_rng(0))
+"""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from wpt_agents.shards import (
+    BLOCK,
+    Entry,
+    Meta,
+    Writer,
+    create_folder,
+    read_index,
+    read_meta,
+    read_steps,
+)
+from wpt_agents.trajectory import IMAGE_SIZE, Batch, Trajectory
+from wpt_agents.windows import Piece, Windows, make_batch
+
+T = TypeVar("T")
+
+
+class Damage(NamedTuple):
+    """A trajectory that cannot be read, and why."""
+
+    index: int
+    reason: str
+
+
+class _Part(Trajectory):
+    """Some steps of a trajectory; the whole was checked when it was appended."""
+
+    def __post_init__(self) -> None:
+        pass
+
+
+class TrajectoryDataset:
+    """Trajectories in a folder (see `wpt_agents.shards`); one writer, any number of readers.
+
+    A reader sees the trajectories that were there when it opened the folder. Nothing but the index
+    is held in memory.
+
+    :param ids: where each trajectory stands in the folder, for a subset
+    :param workers: threads that decompress
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        meta: Meta,
+        entries: list[Entry],
+        ids: Sequence[int] | None = None,
+        workers: int = 2,
+    ) -> None:
+        self.path, self.workers = path, workers
+        self._meta, self._entries, self._ids = meta, entries, ids
+        self._writer: Writer | None = None
+        self._windows: Windows | None = None
+        self._pool: ThreadPoolExecutor | None = None
+        self._pool_owner = 0
+
+    @classmethod
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        image_size: int = IMAGE_SIZE,
+        codec: str = "zstd",
+        workers: int = 2,
+    ) -> "TrajectoryDataset":
+        """Makes an empty dataset in a new or empty folder.
+
+        :param codec: "zstd" (lossless, about a fifth) or "raw"
+        """
+        create_folder(Path(path), Meta(image_size, codec))
+        return cls.open(path, workers)
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], workers: int = 2) -> "TrajectoryDataset":
+        """Opens a dataset, reading its index only.
+
+        :raises ValueError: no dataset there, one of a newer version, or a damaged index
+        """
+        path = Path(path)
+        return cls(path, read_meta(path), read_index(path)[0], workers=workers)
+
+    def append(self, trajectory: Trajectory) -> None:
+        """Adds a trajectory at the end. Once this returns, readers who open the folder see it.
+
+        :raises ValueError: another image size, non-zero padding, a subset, or another writer
+        """
+        if self._ids is not None:
+            raise ValueError("A subset is read-only; append to the dataset it was taken from")
+        size = self._meta.image_size
+        if trajectory.image.shape[1:3] != (size, size):
+            raise ValueError(
+                f"{self.path} holds images of {size} x {size}, got "
+                f"{trajectory.image.shape[1]} x {trajectory.image.shape[2]}; resize them, or "
+                "create a dataset with that image_size"
+            )
+        if trajectory.action[:, trajectory.action_dim :].any():
+            raise ValueError(
+                f"Actions past action_dim={trajectory.action_dim} must be zero; "
+                f"give the true action_dim, of at most {trajectory.action.shape[1]}"
+            )
+        if self._writer is None:
+            self._writer = Writer(self.path, self._meta)
+            self._entries = self._writer.entries
+        self._writer.append(trajectory)
+        self._windows = None
+
+    def flush(self) -> None:
+        """Makes what was appended survive a power cut; a killed process loses nothing anyway."""
+        if self._writer is not None:
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Ends the appending and the threads; the dataset can still be read."""
+        if self._writer is not None:
+            self._writer.close()
+            self._entries, self._writer = list(self._entries), None
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def __enter__(self) -> "TrajectoryDataset":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        """The number of trajectories."""
+        return len(self._entries)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        """Trajectory `i`, whole, its actions `action_dim` wide.
+
+        :raises ValueError: it is damaged
+        """
+        entry = self._entries[i]
+        part, _, _ = self._read((i % len(self), 0, entry.length + 1))
+        return Trajectory(**vars(part))
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """(N,) int, the number of actions of each trajectory."""
+        return np.array([entry.length for entry in self._entries], np.int64)
+
+    @property
+    def action_dims(self) -> np.ndarray:
+        """(N,) int, the true action width of each trajectory."""
+        return np.array([entry.action_dim for entry in self._entries], np.int64)
+
+    @property
+    def embodiments(self) -> list[str | None]:
+        """The robots' names, None where unknown."""
+        return [entry.embodiment for entry in self._entries]
+
+    @property
+    def tasks(self) -> list[str | None]:
+        """What each behaviour was after, None where unknown."""
+        return [entry.task for entry in self._entries]
+
+    @property
+    def max_action_dim(self) -> int:
+        """The widest embodiment's action width, 0 without trajectories."""
+        return max((entry.action_dim for entry in self._entries), default=0)
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of the images."""
+        return self._meta.image_size
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> "TrajectoryDataset":
+        """A read-only view of some trajectories, in the order given."""
+        entries = [self._entries[i] for i in indices]
+        ids = [self._id(i) for i in indices]
+        return TrajectoryDataset(self.path, self._meta, entries, ids, self.workers)
+
+    def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
+        """The first image of every trajectory, in order: (n, 64, 64, 3) uint8 with n <= `batch`."""
+        for at in range(0, len(self), batch):
+            chunk = range(at, min(at + batch, len(self)))
+            yield np.stack([part.image[0] for part, _, _ in self._each(self._first, chunk)])
+
+    def _first(self, i: int) -> tuple[Trajectory, int, int]:
+        return self._read((i, 0, 1))
+
+    def sample(
+        self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
+    ) -> Batch:
+        """Windows drawn by the rule of `wpt_agents.windows`; nothing but `rng` decides which.
+
+        :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
+            `action_width`
+        """
+        if not self._entries:
+            raise ValueError(f"{self.path} holds no trajectory; append some before sampling")
+        if self._windows is None:
+            self._windows = Windows(self.lengths)
+        rows = self._windows.draw(batch_size, length, rng)
+        shape = (self.image_size, self.image_size, 3)
+        return make_batch(rows, self._read, shape, action_width, self._each)
+
+    def info(self) -> dict[str, Any]:
+        """Counts, widths, lengths and how many bytes an image takes."""
+        stored = sum(entry.size for entry in self._entries)
+        images = int(self.lengths.sum()) + len(self)
+        return {
+            "path": str(self.path),
+            "trajectories": len(self),
+            "transitions": images - len(self),
+            "lengths": [int(self.lengths.min()), int(self.lengths.max())] if len(self) else [],
+            "embodiments": dict(Counter(self.embodiments)),
+            "action_dims": {int(k): n for k, n in Counter(self.action_dims).items()},
+            "with_reward": sum(entry.reward for entry in self._entries),
+            "image_size": self.image_size,
+            "codec": self._meta.codec,
+            "bytes": stored,
+            "bytes_per_image": stored / images if images else 0.0,
+            "compression": images * self.image_size**2 * 3 / stored if images else 1.0,
+        }
+
+    def validate(self, progress_bar: bool = False) -> list[Damage]:
+        """Reads every byte and names the trajectories that are damaged; [] if all is well."""
+        from tqdm.auto import tqdm
+
+        damaged = []
+        with tqdm(total=len(self), desc="validate", disable=not progress_bar) as bar:
+            for at in range(0, len(self), 256):
+                for damage in self._each(self._damage, range(at, min(at + 256, len(self)))):
+                    damaged += [damage] if damage is not None else []
+                    bar.update()
+        return damaged
+
+    def _damage(self, i: int) -> Damage | None:
+        try:
+            self[i]
+        except ValueError as error:
+            return Damage(i, str(error))
+        return None
+
+    def _each(self, function: Callable[[int], T], items: Iterable[int]) -> Iterable[T]:
+        if self.workers < 1:
+            return map(function, items)
+        if self._pool is None or self._pool_owner != os.getpid():  # threads do not survive a fork
+            self._pool, self._pool_owner = ThreadPoolExecutor(self.workers, "dataset"), os.getpid()
+        return self._pool.map(function, items)
+
+    def _id(self, i: int) -> int:
+        return int(i) % len(self) if self._ids is None else self._ids[i]
+
+    def _read(self, piece: Piece) -> tuple[Trajectory, int, int]:
+        """The blocks a piece lies in, as a trajectory, and the piece's place therein."""
+        i, start, stop = piece
+        entry = self._entries[i]
+        first, last = max(start - 1, 0) // BLOCK, (stop - 1) // BLOCK  # with the reward before it
+        try:
+            image, action, reward = read_steps(self.path, self._meta, entry, first, last)
+        except OSError as error:
+            raise ValueError(
+                f"Trajectory {self._id(i)} of {self.path} is damaged: {error}. `validate` lists "
+                "all that are; leave them out with `subset`"
+            ) from error
+        start, stop = start - first * BLOCK, stop - first * BLOCK
+        part = _Part(
+            image=image[:stop],
+            action=action[: stop - 1],
+            reward=None if reward is None else reward[: stop - 1],
+            terminated=entry.terminated and piece[2] == entry.length + 1,
+            action_dim=entry.action_dim,
+            embodiment=entry.embodiment,
+            task=entry.task,
+            source=entry.source,
+        )
+        return part, start, stop

@@ -1,0 +1,1 @@
+"""The tasks which dm_control does not have, in its own layout."""

@@ -1,0 +1,260 @@
+"""The one renderer: a model's picture at three prices, from a GL context of its own."""
+
+import atexit
+import os
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from wpt_envs import headless  # before mujoco: it chooses the GL backend
+
+# isort: split
+import mujoco
+
+_FLAGS = {
+    "shadow": mujoco.mjtRndFlag.mjRND_SHADOW,
+    "reflection": mujoco.mjtRndFlag.mjRND_REFLECTION,
+}
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a rendering spends. `None` keeps what the model asks for."""
+
+    samples: int | None = None  # multisampling
+    supersample: int = 1  # draws so many times larger, then averages
+    shadow_size: int | None = None  # texels of the shadow map
+    tessellation: tuple[int, int, int] | None = None  # slices, stacks, quads of round shapes
+    cell: float | None = None  # meshes are thinned to one vertex in a cell of this many metres
+    off: tuple[str, ...] = field(default=())
+
+
+QUALITIES = {
+    "exact": Quality(),
+    "near": Quality(samples=4, shadow_size=256, tessellation=(12, 6, 2), cell=0.005),
+    "fast": Quality(
+        samples=0,
+        supersample=2,
+        tessellation=(12, 6, 2),
+        cell=0.005,
+        off=("shadow", "reflection"),
+    ),
+}
+
+
+class Renderer:
+    """Draws `data` as seen by one camera. Physics is never touched.
+
+    The GL context is made at the first picture, so that an environment which never draws
+    costs none, and is current only while it draws, so that nobody else's frames change.
+
+    :param camera: name or number of a camera of the model, -1 is the free camera
+    :param flip: turns the picture upside down
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        size: int = 64,
+        rendering: str = "near",
+        camera: str | int = -1,
+        flip: bool = False,
+    ) -> None:
+        if rendering not in QUALITIES:
+            raise ValueError(f"No rendering {rendering!r}. There are: {', '.join(QUALITIES)}")
+        self._model, self._data, self._size = model, data, size
+        self._quality = QUALITIES[rendering]
+        self._camera = _camera(model, camera)
+        self._flip = flip
+        self._gl: Any = None
+
+    def render(self) -> np.ndarray:
+        """The picture now: (size, size, 3) uint8, the top row first."""
+        if self._gl is None or self._process != os.getpid():  # a context does not survive a fork
+            self._open()
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._option,
+            self._perturb,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        with _current(self._gl):
+            mujoco.mjr_render(self._viewport, self._scene, self._mjr)
+            mujoco.mjr_readPixels(self._pixels, None, self._viewport, self._mjr)
+        image = self._pixels if self._flip else self._pixels[::-1]  # GL's first row is the lowest
+        return _shrink(image, self._quality.supersample)
+
+    def upload_terrain(self) -> None:
+        """Shows the model's height fields as they are now."""
+        if self._gl is not None:
+            with _current(self._gl):
+                for field_id in range(self._model.nhfield):
+                    mujoco.mjr_uploadHField(self._model, self._mjr, field_id)
+
+    def close(self) -> None:
+        """Frees the GL context; the next picture makes a new one."""
+        if self._gl is not None:
+            self._finalizer()
+            self._gl = self._mjr = None
+
+    def _open(self) -> None:
+        side = self._size * self._quality.supersample
+        self._viewport = mujoco.MjrRect(0, 0, side, side)
+        self._pixels = np.empty((side, side, 3), np.uint8)
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._scene = mujoco.MjvScene(self._model, maxgeom=max(1000, 4 * self._model.ngeom))
+        for name in self._quality.off:
+            self._scene.flags[_FLAGS[name]] = 0
+        self._gl = _new_gl(side)
+        self._process = os.getpid()
+        with _current(self._gl), _lowered(self._model, self._quality, side):
+            self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
+        self._finalizer = weakref.finalize(self, _free, self._gl, self._mjr, self._process)
+
+
+def _camera(model: mujoco.MjModel, camera: str | int) -> mujoco.MjvCamera:
+    names = [model.camera(index).name for index in range(model.ncam)]
+    if isinstance(camera, str):
+        if camera not in names:
+            raise ValueError(f"No camera {camera!r}. There are: {', '.join(names)}")
+        camera = names.index(camera)
+    if not -1 <= camera < model.ncam:
+        raise ValueError(f"No camera {camera}. There are: -1 (free), {', '.join(names)}")
+    view = mujoco.MjvCamera()
+    if camera == -1:
+        mujoco.mjv_defaultFreeCamera(model, view)
+    else:
+        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+    return view
+
+
+def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    """Averages squares of `factor` x `factor` pixels; always a fresh array."""
+    if factor == 1:
+        return image.copy()
+    total = image[::factor, ::factor].astype(np.uint16)
+    for offset in range(1, factor * factor):
+        total += image[offset // factor :: factor, offset % factor :: factor]
+    return ((total + factor * factor // 2) // (factor * factor)).astype(np.uint8)
+
+
+# ---------------------------------------------------------------------------- GL contexts
+
+
+def _egl() -> ModuleType | None:
+    if headless.choose() != "egl":
+        return None
+    import mujoco.egl
+
+    return mujoco.egl
+
+
+def _new_gl(side: int) -> Any:
+    egl = _egl()
+    if egl is None:
+        from mujoco.gl_context import GLContext
+
+        return GLContext(side, side)
+    first = egl.EGL_DISPLAY is None
+    context = egl.GLContext(side, side)
+    if first:  # dm_control shares the display and frees its contexts later than this would end it
+        atexit.unregister(egl.EGL.eglTerminate)
+    return context
+
+
+@contextmanager
+def _current(gl: Any) -> Iterator[None]:
+    """Makes a context current, and afterwards the one which was: others count on theirs."""
+    egl = _egl()
+    if egl is None:
+        gl.make_current()
+        yield
+        return
+    before = egl.EGL.eglGetCurrentContext() or egl.EGL.EGL_NO_CONTEXT
+    gl.make_current()
+    try:
+        yield
+    finally:
+        nothing = egl.EGL.EGL_NO_SURFACE
+        egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, before)
+
+
+def _free(gl: Any, mjr: mujoco.MjrContext, process: int) -> None:
+    if process == os.getpid():
+        with _current(gl):
+            mjr.free()
+        gl.free()
+
+
+# ------------------------------------------------------------------- cheaper uploads
+
+
+@contextmanager
+def _lowered(model: mujoco.MjModel, quality: Quality, side: int) -> Iterator[None]:
+    """Lowers what a GL context reads of the model while it is made, then puts all of it back."""
+    drawing = model.vis.quality, model.vis.global_
+    wanted = {"offwidth": side, "offheight": side}
+    if quality.samples is not None:
+        wanted["offsamples"] = quality.samples
+    if quality.shadow_size is not None:
+        wanted["shadowsize"] = quality.shadow_size
+    if quality.tessellation is not None:
+        wanted |= dict(
+            zip(("numslices", "numstacks", "numquads"), quality.tessellation, strict=True)
+        )
+    before = [
+        (part, name, getattr(part, name))
+        for part in drawing
+        for name in wanted
+        if hasattr(part, name)
+    ]
+    arrays = [
+        (array, array.copy())
+        for array in (
+            model.mesh_facenum,
+            model.mesh_face,
+            model.mesh_facenormal,
+            model.mesh_facetexcoord,
+        )
+    ]
+    try:
+        for part, name, _ in before:
+            setattr(part, name, wanted[name])
+        if quality.cell is not None:
+            _thin_meshes(model, quality.cell)
+        yield
+    finally:
+        for part, name, value in before:
+            setattr(part, name, value)
+        for array, value in arrays:
+            array[:] = value
+
+
+def _thin_meshes(model: mujoco.MjModel, cell: float) -> None:
+    """Merges the vertices of each mesh that share a cell, and drops the faces this flattens."""
+    for mesh in range(model.nmesh):
+        start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        first, vertices = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        keys = np.floor(model.mesh_vert[first : first + vertices] / cell).astype(np.int64)
+        _, chosen, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        faces = model.mesh_face[start : start + count].copy()
+        corners = group.reshape(-1)[faces]
+        a, b, c = corners.T
+        kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+        _, unique = np.unique(np.sort(corners[kept], axis=1), axis=0, return_index=True)
+        kept = kept[np.sort(unique)]
+        target = slice(start, start + len(kept))
+        model.mesh_face[target] = chosen[corners[kept]]
+        for array in (model.mesh_facenormal, model.mesh_facetexcoord):
+            array[target] = array[start : start + count][kept]
+        model.mesh_facenum[mesh] = len(kept)

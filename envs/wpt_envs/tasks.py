@@ -1,0 +1,104 @@
+"""The table: one row a task. Names, embodiments, widths and lengths stand here and nowhere else."""
+
+import difflib
+from dataclasses import dataclass
+
+# DMControl: embodiment -> (width of its actions, paper's tasks, further tasks)
+_DMC = {
+    "cartpole": (
+        1,
+        ("balance",),
+        ("balance-sparse", "swingup", "swingup-sparse", "two-poles", "three-poles"),
+    ),
+    "acrobot": (1, ("swingup", "swingup-sparse", "swingup-hard"), ()),
+    "cheetah": (
+        6,
+        ("run", "run-backwards", "jump", "run-front", "run-back"),
+        ("run-hard",),
+    ),
+    "walker": (
+        6,
+        ("stand", "walk", "run", "walk-backwards", "run-backwards", "backflip", "walk-hard"),
+        (),
+    ),
+    "quadruped": (
+        12,
+        ("stand", "walk", "run", "jump", "roll", "roll-fast"),
+        ("escape", "fetch"),
+    ),
+}
+
+_METAWORLD = """
+    assembly basketball bin-picking box-close button-press button-press-topdown
+    button-press-topdown-wall button-press-wall coffee-button coffee-pull coffee-push dial-turn
+    disassemble door-close door-lock door-open door-unlock drawer-close drawer-open faucet-close
+    faucet-open hammer hand-insert handle-press handle-press-side handle-pull handle-pull-side
+    lever-pull peg-insert-side peg-unplug-side pick-out-of-hole pick-place pick-place-wall
+    plate-slide plate-slide-back plate-slide-back-side plate-slide-side push push-back push-wall
+    reach reach-wall shelf-place soccer stick-pull stick-push sweep sweep-into window-close
+    window-open
+""".split()
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row: a task of a suite."""
+
+    suite: str
+    name: str
+    embodiment: str
+    action_dim: int  # true width, without padding
+    frames: int  # control steps an episode, before any action repeat
+    metric: str  # "return", or "success" at the last step
+    in_paper: bool  # counts among the 22 + 50
+
+    @property
+    def id(self) -> str:
+        """The id for `gymnasium.make`."""
+        return f"wpt/{self.suite}-{self.name}-v0"
+
+
+def _rows() -> list[Task]:
+    rows = []
+    for domain, (width, paper, further) in _DMC.items():
+        for name in paper + further:
+            row = Task("dmc", f"{domain}-{name}", domain, width, 1000, "return", name in paper)
+            rows.append(row)
+    for name in _METAWORLD:
+        rows.append(Task("metaworld", name, "sawyer", 4, 200, "success", True))
+    return rows
+
+
+TASKS: dict[str, Task] = {task.id: task for task in _rows()}
+
+# B.1, the order in which one agent learns them
+ANT_SEQUENCE: tuple[str, ...] = tuple(
+    f"wpt/dmc-quadruped-{name}-v0" for name in ("stand", "walk", "run", "jump", "roll", "roll-fast")
+)
+
+
+def suite(name: str, paper_only: bool = True) -> list[Task]:
+    """The tasks of one suite, in the table's order."""
+    rows = [task for task in TASKS.values() if task.suite == name]
+    if not rows:
+        suites = sorted({task.suite for task in TASKS.values()})
+        raise ValueError(f"No suite {name!r}. There are: {', '.join(suites)}")
+    return [task for task in rows if task.in_paper or not paper_only]
+
+
+def suite_width(name: str) -> int:
+    """The width of the widest actions in a suite's paper tasks: what `pad_action_to="suite"` is."""
+    return max(task.action_dim for task in suite(name, paper_only=False) if task.in_paper)
+
+
+def find(suite_name: str, name: str) -> Task:
+    """The row of a task; an unknown name is answered with the nearest ones."""
+    task = TASKS.get(f"wpt/{suite_name}-{name}-v0")
+    if task is None:
+        names = [row.name for row in suite(suite_name, paper_only=False)]
+        near = difflib.get_close_matches(name, names, n=3) or names
+        raise ValueError(
+            f"No task {name!r} in suite {suite_name!r}. Nearest: {', '.join(near)}. "
+            "All: wpt_envs.tasks.TASKS"
+        )
+    return task

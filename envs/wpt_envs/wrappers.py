@@ -1,0 +1,145 @@
+"""Small wrappers, each named by its verb: CheckAction, RepeatAction, PadAction, SeePixels."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+
+class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
+    """Refuses an action of the wrong shape, outside the box or not finite, before it acts."""
+
+    def __init__(self, env: gym.Env) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.ActionWrapper.__init__(self, env)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """The same action as float32, or a ValueError.
+
+        :param action: (A,)
+        """
+        action, box = np.asarray(action, np.float32), self.action_space
+        if action.shape != box.shape:
+            raise ValueError(f"The action has shape {action.shape}; {box.shape} is wanted")
+        if not np.isfinite(action).all():
+            raise ValueError(f"The action holds NaN or infinity: {action}")
+        if np.any(action < box.low - 1e-6) or np.any(action > box.high + 1e-6):
+            raise ValueError(
+                f"The action {action} lies outside [{box.low.min()}, {box.high.max()}]; "
+                "clip it with numpy.clip"
+            )
+        return action
+
+
+class PadAction(gym.ActionWrapper, RecordConstructorArgs):
+    """Widens the actions to `size`; the environment gets the leading ones."""
+
+    def __init__(self, env: gym.Env, size: int) -> None:
+        RecordConstructorArgs.__init__(self, size=size)
+        gym.ActionWrapper.__init__(self, env)
+        (width,) = env.action_space.shape
+        if size < width:
+            raise ValueError(
+                f"pad_action_to={size} is narrower than the task's {width} actions; "
+                f"give {width} or more, or None"
+            )
+        self._width = width
+        self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """The entries which the environment has."""
+        return action[: self._width]
+
+
+class RepeatAction(gym.Wrapper, RecordConstructorArgs):
+    """Applies each action `times` times and sums the rewards; stops where the episode ends."""
+
+    def __init__(self, env: gym.Env, times: int) -> None:
+        RecordConstructorArgs.__init__(self, times=times)
+        gym.Wrapper.__init__(self, env)
+        if times < 1:
+            raise ValueError(f"action_repeat={times}; give 1 or more")
+        self._times = times
+        self.metadata = dict(env.metadata)
+        if "render_fps" in env.metadata:
+            self.metadata["render_fps"] = env.metadata["render_fps"] / times
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step of the agent: the last observation and info, the sum of the rewards."""
+        total = 0.0
+        for _ in range(self._times):
+            obs, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        return obs, total, terminated, truncated, info
+
+
+class SeePixels(gym.Wrapper, RecordConstructorArgs):
+    """Replaces the observation by the picture, taken once after the step.
+
+    The environment underneath has `look(size)`, its picture as (size, size, 3) uint8.
+
+    :param state_in_info: puts the observation underneath into `info["state"]`
+    :param render_size: side of what `render()` answers; `None` is the last observation
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        image_size: int = 64,
+        state_in_info: bool = False,
+        render_size: int | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, image_size=image_size, state_in_info=state_in_info, render_size=render_size
+        )
+        gym.Wrapper.__init__(self, env)
+        self._image_size, self._render_size = image_size, render_size or image_size
+        self._state_in_info = state_in_info
+        self._image: np.ndarray | None = None
+        self.observation_space = spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """The first picture of an episode."""
+        state, info = self.env.reset(**kwargs)
+        return self._seen(state, info)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """The picture after the step."""
+        state, reward, terminated, truncated, info = self.env.step(action)
+        image, info = self._seen(state, info)
+        return image, float(reward), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """The last picture, at `render_size`."""
+        if self.render_mode is None:
+            return None
+        if self._render_size == self._image_size and self._image is not None:
+            return self._image.copy()
+        return self.get_wrapper_attr("look")(self._render_size)
+
+    def _seen(self, state: Any, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+        if self._state_in_info:
+            info = info | {"state": state}
+        self._image = self.get_wrapper_attr("look")(self._image_size)
+        return self._image.copy(), info
+
+
+def dress(
+    env: gym.Env,
+    *,
+    image_size: int,
+    action_repeat: int,
+    pad_action_to: int | None,
+    state_in_info: bool,
+    render_size: int | None,
+) -> gym.Env:
+    """An environment with `look` in its pixel clothes: repeat, see, pad, check."""
+    env = RepeatAction(env, action_repeat)
+    env = SeePixels(env, image_size, state_in_info, render_size)
+    if pad_action_to is not None:
+        env = PadAction(env, pad_action_to)
+    return CheckAction(env)

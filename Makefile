@@ -1,0 +1,66 @@
+# Two commands on a bare machine (Python 3.11+, git, a shell):
+#   make demo    installs, then runs the whole method on one task in minutes
+#   make test    installs, then runs the tests
+# Both make .venv when it is not there. Nothing outside this folder is written.
+
+PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13,$(if $(shell $(p) -c "import sys; print(sys.version_info >= (3, 11) or '')" 2>/dev/null),$(p))))
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+# torch comes before everything else, and alone, so that pip takes the build that is offered for this
+# machine (a local CPU wheel, say) and the rest only finds it installed. Without a GPU and without a
+# local wheel, the small CPU build comes from PyTorch's own index:
+#   make demo TORCH_ARGS="--index-url https://download.pytorch.org/whl/cpu"
+TORCH ?= torch==2.13.0
+TORCH_RANGE := torch>=2.8,<2.14
+TORCH_ARGS ?=
+DEMO_ARGS ?=
+TEST_ARGS ?=
+
+.PHONY: help demo test lint install rendering clean
+
+help:
+	@sed -n "s/^#   \(make [a-z]*  \)/  \1/p" Makefile
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml
+	@test -n "$(PYTHON)" || { \
+	  echo "Python 3.11 or newer is needed; found: $$(python3 --version 2>&1 || echo none)."; \
+	  echo "Install one, or name it: make PYTHON=/path/to/python3.11"; exit 1; }
+	@echo "[install 1/4] an environment in $(VENV), from $(PYTHON) ($$($(PYTHON) --version))"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+	  echo "Could not make $(VENV). On Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
+	@echo "[install 2/4] $(TORCH) (the largest download, a few minutes)"
+	@$(PIP) install -q $(TORCH_ARGS) "$(TORCH)" || { \
+	  echo "              not to be had; taking the newest of $(TORCH_RANGE)"; \
+	  $(PIP) install -q $(TORCH_ARGS) "$(TORCH_RANGE)"; }
+	@echo "[install 3/4] wpt-agents and what it needs (simulators, Stable-Baselines3, tools)"
+	@$(PIP) install -q -e ".[dev]"
+	@echo "[install 4/4] a check that the parts fit together"
+	@$(PIP) check || echo "              pip names a conflict above; going on"
+	@$(BIN)/python -c "import torch, mujoco, stable_baselines3 as sb3; print('              torch', torch.__version__ + ', mujoco', mujoco.__version__ + ', stable-baselines3', sb3.__version__)"
+	@touch $@
+
+# The simulators draw without a display, by EGL or OSMesa. Which one is chosen, or what to install.
+rendering: $(INSTALLED)
+	@$(BIN)/python -c "import sys; from wpt_envs import headless; print('[rendering] off-screen by', headless.choose() or 'the window system')" 2>/dev/null || { \
+	  echo "No off-screen OpenGL: neither EGL nor OSMesa works on this machine. Install one:"; \
+	  echo "  apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"; \
+	  echo "  apt-get install libosmesa6"; exit 1; }
+
+demo: rendering
+	@echo "[demo] collect, pre-train, index, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
+	@$(BIN)/python -m wpt_agents.zoo run --suite dmc --tasks cartpole-swingup --preset demo $(DEMO_ARGS)
+
+test: rendering
+	@echo "[test] pytest $(TEST_ARGS)"
+	@$(BIN)/python -m pytest $(TEST_ARGS)
+
+lint: $(INSTALLED)
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache

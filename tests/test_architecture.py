@@ -11,11 +11,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = [
-    {"trajectory", "distributions", "networks", "guidance", "archive"},
-    {"windows"},
+    {"trajectory", "distributions", "networks", "guidance", "archive", "names"},
+    {"windows", "shards", "model_file"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "world_model"},
     {"policy"},
+    {"rollout"},
     {"wpt"},
     {"zoo"},
 ]

@@ -1,0 +1,329 @@
+"""One (suite, task, seed, method) -> one run folder, with everything that was done and came out.
+
+A run collects, pre-trains, indexes, fine-tunes and evaluates; `wpt_agents.zoo.stages` holds what
+runs share. `result.json` is written last: where it stands, the run is finished.
+"""
+
+import json
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import VecEnv
+from wpt_envs.tasks import Task
+
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.names import unknown_name
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo import pictures, report
+from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
+from wpt_agents.zoo.presets import Preset, wpt_keywords
+from wpt_agents.zoo.stages import BASELINES, Shared, console, say, write_json
+from wpt_agents.zoo.tasks import short_name
+
+EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
+PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
+SIMULATORS = ("dm-control", "metaworld")
+
+
+@dataclass(frozen=True)
+class Method:
+    """Which of the paper's parts are on.
+
+    :param wpt: keywords of WPT that switch the others off
+    """
+
+    pretrained: bool = True
+    needs_data: bool = True
+    wpt: Mapping[str, Any] = field(default_factory=dict)
+
+
+METHODS = {
+    "wpt": Method(),
+    "scratch": Method(False, False, {"offline_ratio": 0.0, "guidance": 0.0}),
+    "no-guidance": Method(wpt={"guidance": 0.0}),
+    "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
+    "no-pretrain": Method(pretrained=False),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run, fully told before it begins."""
+
+    task: Task
+    seed: int
+    method: str
+    preset_name: str
+    preset: Preset
+    out: Path
+    workers: int = 2
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise unknown_name("method", self.method, METHODS)
+
+    @property
+    def folder(self) -> Path:
+        """out/preset/method/task_seed, the layout that RL Zoo's plots read."""
+        name = f"{short_name(self.task)}_{self.seed}"
+        return self.out / self.preset_name / self.method / name
+
+    @property
+    def shared(self) -> Shared:
+        """The stages that this run shares with others."""
+        return Shared(self.preset, self.task.suite, self.out / "cache", self.workers, self.device)
+
+    @property
+    def wpt(self) -> dict[str, Any]:
+        """The keywords of WPT, the method's switches included."""
+        return {**self.preset.wpt, **METHODS[self.method].wpt}
+
+    @property
+    def updates(self) -> int:
+        """The fine-tuning updates that the run will make, within an episode's worth."""
+        wpt = wpt_keywords() | self.wpt
+        steps = max(self.preset.steps - wpt["learning_starts"], 0)
+        return int(steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"]))
+
+    @property
+    def evaluation_seed(self) -> int:
+        """Where evaluation's episodes start; below 2**31, as some simulators want."""
+        state = np.random.SeedSequence([self.seed, EVALUATION]).generate_state(1)
+        return int(state[0] >> 1)
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, as `config.yaml` holds it."""
+        about = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
+        return {
+            **about,
+            "seed": self.seed,
+            "preset": self.preset_name,
+            **self.preset.as_dict(),
+            "wpt": self.wpt,
+        }
+
+    def result(self) -> dict[str, Any] | None:
+        """What `result.json` holds, None while the run is not finished."""
+        path = self.folder / "result.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+
+def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
+    """Does the runs one after the other; one that fails is told and the rest goes on.
+
+    :return: whether all are finished
+    """
+    for job in jobs:
+        check_folder(job, force)
+    for number, job in enumerate(jobs, 1):
+        say(f"run {number}/{len(jobs)}", f"{short_name(job.task)}, {job.method}, seed {job.seed}")
+        try:
+            result = run(job, force)
+        except Exception as error:  # whatever one run dies of, the others are not to blame
+            console.print(f"[red]failed[/red]: {error}\nTraceback: {job.folder / 'error.txt'}")
+            continue
+        console.print(report.scores_table(result))
+        console.print(f"Run folder: [bold]{job.folder.resolve()}[/bold]")
+    results = [result for job in jobs if (result := job.result())]
+    if len(results) > 1:
+        console.print(report.summary_table(report.summarise(results)))
+    return len(results) == len(jobs)
+
+
+def run(job: Run, force: bool = False) -> dict[str, Any]:
+    """Does what of the run is not done yet and returns its result."""
+    check_folder(job, force)
+    done = None if force else job.result()
+    if done is not None:
+        say("run", f"finished before, reused (--force starts anew)  [dim]{job.folder}")
+        return done
+    if job.folder.exists():
+        shutil.rmtree(job.folder)
+    job.folder.mkdir(parents=True)
+    (job.folder / "config.yaml").write_text(yaml.safe_dump(job.config(), sort_keys=False))
+    write_json(job.folder / "system.json", system())
+    (job.folder / "command.txt").write_text(shlex.join([sys.executable, *sys.orig_argv[1:]]) + "\n")
+    try:
+        return _work(job)
+    except Exception:
+        (job.folder / "error.txt").write_text(traceback.format_exc())
+        raise
+
+
+def check_folder(job: Run, force: bool) -> None:
+    """Refuses to take a folder that is not this run's."""
+    path = job.folder / "config.yaml"
+    if job.folder.exists() and any(job.folder.iterdir()) and not path.exists():
+        raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
+    if job.result() and not force:
+        held, wanted = yaml.safe_load(path.read_text()), json.loads(json.dumps(job.config()))
+        differ = sorted(k for k in held.keys() | wanted if held.get(k) != wanted.get(k))
+        if differ:
+            raise ValueError(
+                f"{job.folder} holds a finished run with other settings ({', '.join(differ)}); "
+                "use another --out, or --force to replace it"
+            )
+
+
+class Clock:
+    """The wall seconds of each stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Times a stage."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - start, 1)
+
+
+def _work(job: Run) -> dict[str, Any]:
+    """The stages, one after the other."""
+    method, clock, dataset, start = METHODS[job.method], Clock(), None, None
+    if method.needs_data:
+        with clock("collect"):
+            dataset = job.shared.data()
+    if method.pretrained:
+        assert dataset is not None, method
+        with clock("pretrain"):
+            start = job.shared.model(dataset)
+    monitor = str(job.folder / "0.monitor.csv")
+    with closing(make_vec_env(job.task.id, job.shared.env, job.seed, monitor=monitor)) as venv:
+        model = make_model(job, venv, dataset, start)
+        if dataset is not None:
+            with clock("index"):
+                job.shared.index(model)
+        with clock("learn"):
+            _learn(job, model)
+        model.save(job.folder / "model.zip")
+    with clock("evaluate"):
+        scores = _evaluate(job, model)
+    with clock("pictures"):
+        _draw(job, model, scores)
+    result = _result(job, scores, clock.seconds)
+    write_json(job.folder / "result.json", result)
+    return result
+
+
+def make_model(
+    job: Run, venv: VecEnv, dataset: TrajectoryDataset | None, start: Path | None
+) -> WPT:
+    """The model to fine-tune: pre-trained, or fresh."""
+    keywords = {"dataset": dataset, "seed": job.seed, "device": job.device, **job.wpt}
+    keywords["embodiment"] = job.task.embodiment
+    keywords["episode_length"] = episode_steps(job.task.id, job.shared.env)
+    if start is not None:
+        return WPT.load(start, env=venv, **keywords)
+    return WPT("WPTPolicy", venv, **keywords)
+
+
+def _learn(job: Run, model: WPT) -> None:
+    """Stage 4: fine-tuning, evaluated in between where the preset says so."""
+    preset, callback = job.preset, None
+    text = f"{preset.learn.frames:,} frames, {preset.steps:,} steps of {short_name(job.task)}"
+    say("learn", f"{text}, method {job.method}, seed {job.seed}")
+    model.set_logger(configure(str(job.folder), ["csv", "tensorboard"]))
+    if preset.evaluate.every:
+        callback = EvalCallback(
+            make_vec_env(job.task.id, job.shared.env, job.evaluation_seed),
+            n_eval_episodes=preset.evaluate.during_episodes,
+            eval_freq=max(1, preset.evaluate.every // preset.env.action_repeat),
+            log_path=str(job.folder),
+            deterministic=True,
+            verbose=0,
+        )
+    model.learn(preset.steps, callback=callback, log_interval=1, progress_bar=True)
+
+
+def _evaluate(job: Run, model: WPT) -> dict[str, Score]:
+    """Stage 5: the returns of doing nothing, random actions, the prior actor and WPT."""
+    episodes, seed = job.preset.evaluate.episodes, job.evaluation_seed
+    say("evaluate", f"{episodes} episodes of each policy, from the same initial states")
+    scores = {name: job.shared.baseline(name, job.task, seed) for name in BASELINES}
+    policies = {"prior actor": model.prior, "WPT": model}
+    for name, policy in policies.items():
+        if policy is not None:
+            scores[name] = evaluate(policy, job.task.id, job.shared.env, episodes, seed, name)
+    return scores
+
+
+def _draw(job: Run, model: WPT, scores: Mapping[str, Score]) -> None:
+    """Stage 6: the learning curve, a video and a strip of predictions."""
+    say("pictures", "learning_curve.png, policy.mp4, predictions.png")
+    title = f"{short_name(job.task)}, {job.method}, preset {job.preset_name}, seed {job.seed}"
+    training, repeat = load_results(str(job.folder)), job.preset.env.action_repeat
+    frames, returns = training["l"].cumsum().to_numpy() * repeat, training["r"].to_numpy()
+    path, between = job.folder / "evaluations.npz", None
+    if path.exists():
+        with np.load(path) as held:
+            between = held["timesteps"] * repeat, held["results"]
+    curve = job.folder / "learning_curve.png"
+    pictures.learning_curve(curve, title, frames, returns, scores, between)
+    trajectory, shots, fps = film(model, job.task.id, job.shared.env, job.evaluation_seed)
+    pictures.video(job.folder / "policy.mp4", shots, fps)
+    context = 5
+    predicted = model.open_loop(trajectory, context=context, horizon=40)
+    true = trajectory.image[: len(predicted)]
+    pictures.prediction_strip(job.folder / "predictions.png", title, true, predicted, context)
+
+
+def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) -> dict[str, Any]:
+    """What `result.json` holds."""
+    return {
+        "suite": job.task.suite,
+        "task": short_name(job.task),
+        "method": job.method,
+        "preset": job.preset_name,
+        "seed": job.seed,
+        "frames": job.preset.learn.frames,
+        "steps": job.preset.steps,
+        "metric": job.task.metric,
+        "scores": {name: score.as_dict() for name, score in scores.items()},
+        "seconds": seconds,
+        "commit": commit(),
+    }
+
+
+def commit() -> str | None:
+    """The checkout's commit, '+' behind it when files differ; None outside a checkout."""
+    here = Path(__file__).parent
+    told = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
+        cwd=here,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return told.stdout.strip() or None
+
+
+def system() -> dict[str, Any]:
+    """The machine and the versions that a run was made with."""
+    return {
+        "commit": commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": torch.get_num_threads(),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": {name: version(name) for name in PACKAGES + SIMULATORS},
+    }

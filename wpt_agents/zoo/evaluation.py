@@ -1,0 +1,178 @@
+"""How good a policy is: returns over seeded episodes, their mean and its 95 % interval."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, Self
+
+import gymnasium as gym
+import numpy as np
+import wpt_envs
+from gymnasium import spaces
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from wpt_agents.trajectory import Trajectory
+from wpt_agents.zoo.collect import Act, record
+from wpt_agents.zoo.progress import progress
+
+# Student's t at 97.5 % for 1 .. 30 degrees of freedom.
+T_975 = (
+    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
+    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
+    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
+)
+
+
+class Policy(Protocol):
+    """Anything with SB3's `predict`."""
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Actions (n, A) for observations (n, 64, 64, 3), and the next recurrent state."""
+
+
+@dataclass(frozen=True)
+class DoNothing:
+    """The action zero."""
+
+    action_space: spaces.Box
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, None]:
+        """Zeros, (n, A)."""
+        return np.zeros((len(observation), *self.action_space.shape), np.float32), None
+
+
+class RandomPolicy:
+    """Uniform in the action space."""
+
+    def __init__(self, action_space: spaces.Box, seed: int) -> None:
+        self.action_space, self.rng = action_space, np.random.default_rng(seed)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, None]:
+        """Uniform draws, (n, A), whatever `deterministic` says."""
+        low, high = self.action_space.low, self.action_space.high
+        return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
+    """The mean and its 95 % interval by Student's t; no interval from one value."""
+    mean, n = float(np.mean(values)), len(values)
+    if n < 2:
+        return mean, None, None
+    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
+    half = t * float(np.std(values, ddof=1)) / n**0.5
+    return mean, mean - half, mean + half
+
+
+@dataclass(frozen=True)
+class Score:
+    """The returns of one policy, and successes where the task reports them."""
+
+    returns: list[float]
+    successes: list[bool]
+
+    @property
+    def interval(self) -> tuple[float, float | None, float | None]:
+        """Mean return, and its 95 % interval."""
+        return mean_interval(self.returns)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What `result.json` holds."""
+        mean, low, high = self.interval
+        rate = float(np.mean(self.successes)) if self.successes else None
+        return asdict(self) | {"mean": mean, "low": low, "high": high, "success_rate": rate}
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """Reads back `as_dict`."""
+        return cls(given["returns"], given["successes"])
+
+
+def make_vec_env(
+    task: str, env: Mapping[str, Any], seed: int, n_envs: int = 1, monitor: str | None = None
+) -> VecEnv:
+    """Seeded copies of a task in one process, each under SB3's Monitor."""
+
+    def make() -> gym.Env:
+        return Monitor(gym.make(task, **env), monitor, info_keywords=())
+
+    venv = DummyVecEnv([make] * n_envs)
+    venv.seed(seed)
+    return venv
+
+
+def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
+    """How many calls of `env.step` an episode of the task lasts, when known."""
+    row = wpt_envs.TASKS.get(task)
+    return row.frames // env.get("action_repeat", 2) if row else None
+
+
+def evaluate(
+    policy: Policy, task: str, env: Mapping[str, Any], episodes: int, seed: int, label: str = ""
+) -> Score:
+    """Returns over `episodes` episodes, each with its own seed, all played side by side.
+
+    Policies evaluated with one `seed` meet the same initial states.
+    """
+    successes: list[bool] = []
+    venv = make_vec_env(task, env, seed, episodes)
+    steps = episode_steps(task, env)
+    with closing(venv), progress(steps and steps * episodes, f"evaluate {label}", "steps") as bar:
+
+        def watch(local: dict[str, Any], _: dict[str, Any]) -> None:
+            bar.update(1)
+            if local["done"] and "is_success" in local["info"]:
+                successes.append(bool(local["info"]["is_success"]))
+
+        returns, _ = evaluate_policy(
+            policy, venv, episodes, callback=watch, return_episode_rewards=True
+        )
+    return Score([float(value) for value in returns], successes)
+
+
+def acting(policy: Policy) -> Act:
+    """A policy as `record` plays it: remembers the recurrent state within an episode."""
+    state: Any = None
+
+    def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
+        nonlocal state
+        start = np.array([step == 0])
+        action, state = policy.predict(obs[None], state, start, deterministic=True)
+        return action[0]
+
+    return act
+
+
+def film(
+    policy: Policy, task: str, env: Mapping[str, Any], seed: int, size: int = 256
+) -> tuple[Trajectory, list[np.ndarray], float]:
+    """One episode, its pictures at `size`, and the frames a second that make it real time."""
+    frames: list[np.ndarray] = []
+    act = acting(policy)
+    with closing(gym.make(task, render_mode="rgb_array", render_size=size, **env)) as filmed:
+
+        def act_and_look(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
+            frames.append(np.asarray(filmed.render()))
+            return act(obs, info, step)
+
+        trajectory = record(filmed, act_and_look, seed)
+        return trajectory, frames, float(filmed.metadata.get("render_fps", 25))

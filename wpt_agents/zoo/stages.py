@@ -1,0 +1,176 @@
+"""The stages that runs share: data, pre-trained model, baselines. Made once, reused by later runs.
+
+They stand in `<out>/cache`, each named by a hash of all that it depends on.
+"""
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from rich.console import Console
+from stable_baselines3.common.logger import configure
+from wpt_envs.tasks import Task
+
+from wpt_agents.archive import replacing
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo.collect import collect
+from wpt_agents.zoo.evaluation import DoNothing, Policy, RandomPolicy, Score, evaluate
+from wpt_agents.zoo.presets import Preset
+from wpt_agents.zoo.tasks import find_task
+
+console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
+
+# Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
+FINE_TUNING = {
+    *("actor_critic_learning_rate", "gamma", "lam", "ent_coef", "imagine_horizon", "return_norm"),
+    *("target_fraction", "train_ratio", "learning_starts", "warmup_steps", "guidance"),
+    *("offline_ratio", "num_retrieve", "bc_steps", "bc_batch_size", "bc_learning_rate"),
+}
+
+
+def say(stage: str, text: str) -> None:
+    """One line about a stage, above its progress bar."""
+    console.print(f"[bold]{stage:<10}[/bold]{text}")
+
+
+def key(*parts: Any) -> str:
+    """A short hash of settings and of the library's version."""
+    text = json.dumps([version("wpt-agents"), *parts], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` to `path`, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1))
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Where the shared stages of a preset stand, and how they are made.
+
+    :param cache: the folder that holds them
+    :param workers: processes that collect
+    :param device: where to pre-train
+    """
+
+    preset: Preset
+    suite: str
+    cache: Path
+    workers: int = 2
+    device: str = "auto"
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `gymnasium.make`."""
+        return asdict(self.preset.env)
+
+    @property
+    def tasks(self) -> list[str]:
+        """The ids of the tasks that data are collected on."""
+        return [find_task(self.suite, name).id for name in self.preset.collect.tasks]
+
+    @property
+    def data_path(self) -> Path:
+        """The dataset's folder."""
+        return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
+
+    @property
+    def model_path(self) -> Path:
+        """The folder of the pre-training: model, log, and `done.json` when it is finished."""
+        parts = asdict(self.preset.pretrain), self.pretraining, self.data_path.name
+        return self.cache / f"model-{key(*parts)}"
+
+    @property
+    def pretraining(self) -> dict[str, Any]:
+        """The preset's keywords of WPT that pre-training looks at."""
+        return {k: v for k, v in self.preset.wpt.items() if k not in FINE_TUNING}
+
+    def data(self) -> TrajectoryDataset:
+        """Stage 1: the dataset, collected unless it is there; half of one is continued."""
+        wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
+        try:
+            found = len(TrajectoryDataset.open(self.data_path)) if self.data_path.exists() else 0
+        except ValueError:
+            found = 0  # `collect` says what is wrong
+        state = "reused" if found == wanted else f"continued at {found} of" if found else "making"
+        names = ", ".join(self.preset.collect.tasks)
+        say("collect", f"{state} {wanted} reward-free episodes of {names}  [dim]{self.data_path}")
+        return collect(
+            self.data_path,
+            self.tasks,
+            given.episodes,
+            given.seed,
+            self.workers,
+            given.behaviour,
+            self.env,
+        )
+
+    def model(self, dataset: TrajectoryDataset) -> Path:
+        """Stage 2: the file of the pre-trained model; half a pre-training is continued."""
+        given, folder = self.preset.pretrain, self.model_path
+        model, done = folder / "model.zip", folder / "done.json"
+        state = "reused" if done.exists() else "continued" if model.exists() else "making"
+        say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
+        if not done.exists():
+            start = time.perf_counter()
+            WPT.pretrain(
+                dataset,
+                steps=given.steps,
+                run_dir=folder,
+                seed=given.seed,
+                device=self.device,
+                progress_bar=True,
+                callback=pretraining_log(folder),
+                **self.pretraining,
+            )
+            write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
+        return model
+
+    def index(self, model: WPT) -> None:
+        """Stage 3: the features of every first image, kept beside the dataset."""
+        assert model.dataset is not None
+        before = set(Path(model.dataset.path).iterdir())
+        retriever = model.build_index(progress_bar=True)
+        state = "made" if set(Path(model.dataset.path).iterdir()) - before else "reused"
+        say("index", f"{state}, {len(retriever)} first images  [dim]{model.dataset.path}")
+
+    def baseline(self, name: str, task: Task, seed: int) -> Score:
+        """The score of doing nothing or of the random policy, played unless it is there."""
+        episodes = self.preset.evaluate.episodes
+        path = self.cache / f"{name}-{key(task.id, self.env, episodes, seed)}.json"
+        if path.exists():
+            return Score.of(json.loads(path.read_text()))
+        space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
+        policy = BASELINES[name](space, seed)
+        score = evaluate(policy, task.id, self.env, episodes, seed, name)
+        write_json(path, score.as_dict())
+        return score
+
+
+BASELINES: Mapping[str, Callable[[spaces.Box, int], Policy]] = {
+    "nothing": lambda space, seed: DoNothing(space),
+    "random": RandomPolicy,
+}
+
+
+def pretraining_log(folder: Path) -> Callable[[int, dict[str, float]], None]:
+    """A callback that writes `progress.csv` and TensorBoard events, every 50th update."""
+    logger = configure(str(folder), ["csv", "tensorboard"])
+
+    def write(step: int, metrics: dict[str, float]) -> None:
+        for name, value in metrics.items():
+            logger.record_mean(name, value)
+        if step % 50 == 0:
+            logger.dump(step)
+
+    return write

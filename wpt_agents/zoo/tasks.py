@@ -1,0 +1,39 @@
+"""From what a user types to rows of the task table."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+from wpt_envs import tasks as table
+from wpt_envs.tasks import Task
+
+from wpt_agents.names import unknown_name
+
+
+def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
+    """The tasks of a suite that match: 'walker-run', 'dmc-walker-run', or a pattern, 'walker-*'.
+
+    No pattern: the paper's tasks of the suite.
+    """
+    if suite not in (suites := {row.suite for row in table.TASKS.values()}):
+        raise unknown_name("suite", suite, suites)
+    if not patterns:
+        return table.suite(suite)
+    rows = {row.name: row for row in table.suite(suite, paper_only=False)}
+    found: dict[str, Task] = {}
+    for pattern in patterns:
+        name = pattern.removeprefix("wpt/").removeprefix(f"{suite}-").removesuffix("-v0")
+        matching = {n: row for n, row in rows.items() if fnmatchcase(n, name)}
+        if not matching:
+            raise unknown_name(f"task in suite {suite!r} called", name, rows)
+        found |= matching
+    return list(found.values())
+
+
+def find_task(suite: str, name: str) -> Task:
+    """The one task of this name."""
+    return find_tasks(suite, [name])[0]
+
+
+def short_name(task: Task) -> str:
+    """'dmc-walker-run', as folders and tables call it."""
+    return f"{task.suite}-{task.name}"

@@ -49,6 +49,9 @@ def _osmesa_works() -> bool:
 
 def choose() -> str:
     """Sets `MUJOCO_GL` where it is unset, and says what it is now."""
+    # Mesa's software rasteriser reads this when first opened, which is below. At 64 x 64 its
+    # threads cost more than they bring, and a forked process would wait for them for ever.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     if "MUJOCO_GL" not in os.environ and sys.platform == "linux":
         if _egl_works():
             os.environ["MUJOCO_GL"] = "egl"
@@ -56,9 +59,6 @@ def choose() -> str:
             os.environ["MUJOCO_GL"] = "osmesa"
         else:
             raise RuntimeError(_INSTALL)
-    # Mesa's software rasteriser: at 64 x 64 its worker threads cost more than they bring,
-    # and a forked worker would wait for threads that it did not inherit.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
     return os.environ.get("MUJOCO_GL", "")
 
 

@@ -36,7 +36,7 @@ T = TypeVar("T")
 class Damage(NamedTuple):
     """A trajectory that cannot be read, and why."""
 
-    index: int
+    trajectory: int
     reason: str
 
 

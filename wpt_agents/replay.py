@@ -88,7 +88,7 @@ class ReplayBuffer:
         replay = cls()
         for i, labels in enumerate(about["episodes"]):
             streams = {n: arrays[f"{i}/{n}"] for n in ARRAYS if f"{i}/{n}" in arrays}
-            replay.add(Trajectory(**streams, **labels))
+            replay.add(Trajectory(**(labels | streams)))
         return replay
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from io import FileIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -29,7 +30,7 @@ from wpt_agents.trajectory import Trajectory
 KIND, VERSION = "wpt_agents.TrajectoryDataset", 1
 BLOCK = 16  # steps; longer compresses little better and makes a window's edges dearer
 SHARD_BYTES = 256 * 2**20
-CODECS: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
+CODECS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "zstd": (
         lambda data: zstandard.ZstdCompressor(level=3).compress(data),
         lambda data: zstandard.ZstdDecompressor().decompress(data),

@@ -1,0 +1,358 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import chain, check_chain, tensors
+
+from wpt_agents import shards
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.replay import ReplayBuffer
+from wpt_agents.trajectory import Trajectory
+
+
+def made(path, *trajectories, **kwargs):
+    with TrajectoryDataset.create(path, image_size=8, **kwargs) as dataset:
+        for trajectory in trajectories:
+            dataset.append(trajectory)
+    return TrajectoryDataset.open(path)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def flip_bit(file, at):
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("codec", ["zstd", "raw"])
+@pytest.mark.parametrize("length", [1, 14, 15, 16, 17, 40])
+def test_a_trajectory_comes_back_as_it_was(tmp_path, codec, length):
+    labels = {"terminated": True, "embodiment": "walker", "task": "run", "source": "ours"}
+    old = chain(length, **labels)
+    new = made(tmp_path, chain(3), old, codec=codec)[1]
+    for name, value in vars(old).items():
+        np.testing.assert_array_equal(getattr(new, name), value)
+
+
+def test_missing_rewards_and_labels_stay_missing(tmp_path):
+    new = made(tmp_path, chain(20, reward=None))[0]
+    assert (new.reward, new.embodiment, new.task, new.source) == (None, None, None, None)
+    assert not new.terminated
+
+
+def test_only_the_true_action_width_is_kept(tmp_path):
+    old = chain(5, action_dim=2)
+    padded = Trajectory(old.image, np.pad(old.action, ((0, 0), (0, 4))), action_dim=2)
+    dataset = made(tmp_path, padded)
+    np.testing.assert_array_equal(dataset[0].action, old.action)
+    assert dataset.max_action_dim == 2
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_sample_keeps_to_the_chain(tmp_path, workers):
+    made(tmp_path, *(chain(50, seed, terminated=True) for seed in range(4)), chain(3, 9))
+    with TrajectoryDataset.open(tmp_path, workers=workers) as dataset:
+        batch = dataset.sample(64, 40, 3, rng())
+    check_chain(batch)
+    assert batch.image.shape == (64, 40, 8, 8, 3)
+    assert batch.is_terminal.any()
+
+
+def test_dataset_and_replay_draw_the_same_batch(tmp_path):
+    trajectories = [chain(n, n, terminated=n % 2 == 0) for n in (1, 2, 15, 16, 17, 60)]
+    dataset, replay = made(tmp_path, *trajectories), ReplayBuffer()
+    for trajectory in trajectories:
+        replay.add(trajectory)
+    for seed in range(20):
+        one, two = (d.sample(8, 18, 2, rng(seed)) for d in (dataset, replay))
+        for name, stream in tensors(one).items():
+            np.testing.assert_array_equal(stream, tensors(two)[name])
+
+
+def test_the_same_rng_and_contents_draw_the_same_batch_again(tmp_path):
+    made(tmp_path, chain(50), chain(50, 1))
+    one, two = (TrajectoryDataset.open(tmp_path).sample(4, 9, 2, rng(3)) for _ in range(2))
+    for name, stream in tensors(one).items():
+        np.testing.assert_array_equal(stream, tensors(two)[name])
+
+
+def test_lengths_widths_and_labels(tmp_path):
+    dataset = made(tmp_path, chain(4, embodiment="a", task="run"), chain(9, action_dim=5))
+    assert len(dataset) == 2
+    assert dataset.lengths.tolist() == [4, 9]
+    assert dataset.action_dims.tolist() == [2, 5]
+    assert (dataset.embodiments, dataset.tasks) == (["a", None], ["run", None])
+    assert (dataset.max_action_dim, dataset.path) == (5, tmp_path)
+    assert [len(trajectory) for trajectory in dataset] == [4, 9]
+    assert len(dataset[-1]) == 9
+
+
+def test_an_index_past_the_end_is_an_index_error(tmp_path):
+    with pytest.raises(IndexError):
+        made(tmp_path, chain(4))[1]
+
+
+def test_a_subset_is_a_view_in_the_order_given(tmp_path):
+    dataset = made(tmp_path, *(chain(n) for n in (4, 5, 6, 7)))
+    view = dataset.subset([3, 1, 2]).subset([-1, 0])
+    assert view.lengths.tolist() == [6, 7]
+    np.testing.assert_array_equal(view[1].image, dataset[3].image)
+    check_chain(view.sample(4, 5, 2, rng()))
+    with pytest.raises(ValueError, match="subset is read-only"):
+        view.append(chain(3))
+
+
+def test_first_observations_come_in_order_and_in_batches(tmp_path):
+    dataset = made(tmp_path, *(chain(20, seed) for seed in range(5)))
+    batches = list(dataset.first_observations(batch=2))
+    assert [len(batch) for batch in batches] == [2, 2, 1]
+    first = np.stack([trajectory.image[0] for trajectory in dataset])
+    np.testing.assert_array_equal(np.concatenate(batches), first)
+
+
+def test_info_counts(tmp_path):
+    info = made(tmp_path, chain(20, embodiment="a"), chain(30, reward=None)).info()
+    assert (info["trajectories"], info["transitions"], info["with_reward"]) == (2, 50, 1)
+    assert (info["embodiments"], info["action_dims"]) == ({"a": 1, None: 1}, {2: 2})
+    assert info["bytes"] == (tmp_path / "shard-00000.bin").stat().st_size
+    # 52 images in one byte value each: far less than 8 * 8 * 3 bytes an image
+    assert info["compression"] > 2
+
+
+def test_the_default_codec_is_lossless_and_smaller_than_raw(tmp_path):
+    small, raw = (made(tmp_path / c, chain(90), codec=c).info()["bytes"] for c in ("zstd", "raw"))
+    assert small < raw / 2
+
+
+def test_shards_roll_over_and_appending_goes_on_after_reopening(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "SHARD_BYTES", 2_000)
+    made(tmp_path, *(chain(20, seed) for seed in range(6)), codec="raw")
+    with TrajectoryDataset.open(tmp_path) as dataset:
+        dataset.append(chain(20, 6))
+        check_chain(dataset.sample(8, 9, 2, rng()))
+    dataset = TrajectoryDataset.open(tmp_path)
+    assert len(list(tmp_path.glob("shard-*.bin"))) == 7
+    for seed, trajectory in enumerate(dataset):
+        np.testing.assert_array_equal(trajectory.image, chain(20, seed).image)
+
+
+def test_a_codec_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"No codec 'gif'\. There are: raw, zstd"):
+        TrajectoryDataset.create(tmp_path, codec="gif")
+
+
+def test_an_empty_dataset_opens_and_is_not_sampled(tmp_path):
+    dataset = made(tmp_path)
+    assert (len(dataset), dataset.max_action_dim, dataset.validate()) == (0, 0, [])
+    assert dataset.info()["transitions"] == 0
+    with pytest.raises(ValueError, match="holds no trajectory"):
+        dataset.sample(1, 2, 1, rng())
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match="nowhere does not exist"):
+        TrajectoryDataset.open(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("meta", [None, "{", "[]", '{"kind": "Trainer"}'])
+def test_a_folder_that_is_no_dataset_is_named(tmp_path, meta):
+    if meta is not None:
+        (tmp_path / "meta.json").write_text(meta)
+    with pytest.raises(ValueError, match=f"{tmp_path.name} is not a dataset"):
+        TrajectoryDataset.open(tmp_path)
+
+
+def test_a_newer_version_is_refused_politely(tmp_path):
+    made(tmp_path, chain(3))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps({**meta, "version": 99}))
+    with pytest.raises(ValueError, match="version 99, this program reads up to 1; upgrade"):
+        TrajectoryDataset.open(tmp_path)
+
+
+def test_a_folder_with_something_in_it_is_not_written_over(tmp_path):
+    made(tmp_path, chain(3))
+    with pytest.raises(ValueError, match="not empty; open a dataset"):
+        TrajectoryDataset.create(tmp_path)
+    assert len(TrajectoryDataset.open(tmp_path)) == 1
+
+
+def test_another_image_size_is_refused_and_nothing_is_written(tmp_path):
+    with TrajectoryDataset.create(tmp_path) as dataset:
+        with pytest.raises(ValueError, match="images of 64 x 64, got 8 x 8; resize"):
+            dataset.append(chain(5))
+        dataset.append(chain(5, size=64))
+    assert len(TrajectoryDataset.open(tmp_path)) == 1
+
+
+def test_padding_that_is_not_zero_is_refused(tmp_path):
+    old = chain(5, action_dim=4)
+    with pytest.raises(ValueError, match="past action_dim=2 must be zero"):
+        made(tmp_path, Trajectory(old.image, old.action, action_dim=2))
+
+
+def test_more_actions_than_the_agent_has_are_refused(tmp_path):
+    dataset = made(tmp_path, chain(5, action_dim=3, embodiment="crab"))
+    with pytest.raises(ValueError, match="crab has 3 actions, the agent takes 2"):
+        dataset.sample(1, 4, 2, rng())
+
+
+def test_a_flipped_bit_is_found_and_refused_by_name(tmp_path):
+    dataset = made(tmp_path, *(chain(40, seed) for seed in range(3)))
+    middle = dataset.info()["bytes"] // 2
+    flip_bit(tmp_path / "shard-00000.bin", middle)
+    [damage] = dataset.validate()
+    assert damage.trajectory == 1
+    assert "does not match its checksum" in damage.reason
+    with pytest.raises(ValueError, match=f"Trajectory 1 of {tmp_path} is damaged"):
+        dataset.subset([1]).sample(4, 40, 2, rng())
+    check_chain(dataset.subset([0, 2]).sample(4, 40, 2, rng()))
+
+
+def test_every_bit_of_a_shard_matters(tmp_path):
+    dataset = made(tmp_path, chain(20))
+    for at in range(0, dataset.info()["bytes"], 7):
+        flip_bit(tmp_path / "shard-00000.bin", at)
+        assert len(dataset.validate()) == 1
+        flip_bit(tmp_path / "shard-00000.bin", at)
+    assert dataset.validate() == []
+
+
+def test_a_truncated_and_a_missing_shard_are_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "SHARD_BYTES", 10)
+    dataset = made(tmp_path, *(chain(40, seed) for seed in range(4)))
+    os.truncate(tmp_path / "shard-00001.bin", 100)
+    (tmp_path / "shard-00003.bin").unlink()
+    assert [damage.trajectory for damage in dataset.validate()] == [1, 3]
+
+
+def test_a_damaged_line_of_the_index_is_named_with_the_remedy(tmp_path):
+    made(tmp_path, chain(3), chain(4), chain(5))
+    index = tmp_path / "index.jsonl"
+    lines = index.read_bytes().splitlines(keepends=True)
+    flip_bit(index, len(lines[0]) + 30)
+    with pytest.raises(ValueError, match=r"line 2 \(trajectory 1\).*delete that line"):
+        TrajectoryDataset.open(tmp_path)
+    index.write_bytes(lines[0] + lines[2])
+    assert TrajectoryDataset.open(tmp_path).lengths.tolist() == [3, 5]
+
+
+def test_a_reader_never_sees_half_a_trajectory(tmp_path):
+    made(tmp_path, chain(20))
+    index = tmp_path / "index.jsonl"
+    line = index.read_bytes()
+    for cut in range(1, len(line)):
+        index.write_bytes(line + line[:cut])  # a second one, its line not yet whole
+        assert len(TrajectoryDataset.open(tmp_path)) == 1
+
+
+def test_the_next_writer_removes_what_a_killed_one_left(tmp_path):
+    made(tmp_path, chain(20))
+    for name in ("index.jsonl", "shard-00000.bin"):
+        with open(tmp_path / name, "ab") as file:
+            file.write(b"0123abcd {half")
+    with TrajectoryDataset.open(tmp_path) as dataset:
+        dataset.append(chain(30, 1))
+    dataset = TrajectoryDataset.open(tmp_path)
+    assert dataset.lengths.tolist() == [20, 30]
+    assert dataset.validate() == []
+    assert (tmp_path / "shard-00000.bin").stat().st_size == dataset.info()["bytes"]
+
+
+def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, monkeypatch):
+    made(tmp_path, chain(20))
+    real, written = os.write, []
+
+    def full(descriptor, data):
+        if len(written) == 2:
+            raise OSError(28, "No space left on device")
+        written.append(real(descriptor, data[:7]))
+        return written[-1]
+
+    with TrajectoryDataset.open(tmp_path) as dataset:
+        monkeypatch.setattr("os.write", full)
+        with pytest.raises(OSError, match="No space"):
+            dataset.append(chain(90, 1))
+        monkeypatch.undo()
+        dataset.append(chain(30, 2))
+    dataset = TrajectoryDataset.open(tmp_path)
+    assert (dataset.lengths.tolist(), dataset.validate()) == ([20, 30], [])
+
+
+def test_a_second_writer_is_refused_until_the_first_is_done(tmp_path):
+    first, second = TrajectoryDataset.create(tmp_path, 8), TrajectoryDataset.open(tmp_path)
+    first.append(chain(3))
+    with pytest.raises(ValueError, match="being written to by someone else"):
+        second.append(chain(4))
+    first.close()
+    second.append(chain(4))
+    second.close()
+    assert TrajectoryDataset.open(tmp_path).lengths.tolist() == [3, 4]
+
+
+def test_a_reader_is_untouched_by_a_writer_at_work(tmp_path):
+    reader = made(tmp_path, chain(20))
+    with TrajectoryDataset.open(tmp_path) as writer:
+        for seed in range(5):
+            writer.append(chain(20, seed))
+            assert len(TrajectoryDataset.open(tmp_path)) == seed + 2
+            check_chain(reader.sample(4, 9, 2, rng(seed)))
+    assert len(reader) == 1
+
+
+def test_a_folder_that_is_read_only_can_be_read(tmp_path):
+    made(tmp_path, chain(20))
+    for file in tmp_path.iterdir():
+        file.chmod(0o444)
+    tmp_path.chmod(0o555)
+    try:
+        check_chain(TrajectoryDataset.open(tmp_path).sample(4, 9, 2, rng()))
+    finally:
+        tmp_path.chmod(0o755)
+
+
+def test_a_fork_that_inherits_the_threads_can_sample(tmp_path):
+    dataset = made(tmp_path, chain(20))
+    dataset.sample(4, 9, 2, rng())
+    dataset._pool_owner = -1  # what a child sees: the threads belong to another process
+    check_chain(dataset.sample(4, 9, 2, rng()))
+    dataset.close()
+
+
+WRITER = """
+import sys
+sys.path.insert(0, {tests!r})
+from chain import chain
+from wpt_agents.dataset import TrajectoryDataset
+dataset = TrajectoryDataset.open({path!r})
+for seed in range(len(dataset), 1_000_000):
+    dataset.append(chain(200, seed, size=32))
+    print(seed + 1, flush=True)
+"""
+
+
+def test_a_killed_writer_loses_at_most_the_trajectory_being_written(tmp_path):
+    TrajectoryDataset.create(tmp_path, image_size=32).close()
+    script = WRITER.format(tests=str(Path(__file__).parent), path=str(tmp_path))
+    known = 0
+    for round_ in range(3):
+        with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as writer:
+            for _ in range(3):
+                known = int(writer.stdout.readline())
+            time.sleep(0.01 * round_)
+            writer.send_signal(signal.SIGKILL)
+            known = int([known, *writer.stdout.read().split(b"\n")[:-1]][-1])
+        dataset = TrajectoryDataset.open(tmp_path)
+        assert known <= len(dataset) <= known + 1
+        assert dataset.validate() == []
+    for seed, trajectory in enumerate(dataset):
+        np.testing.assert_array_equal(trajectory.action, chain(200, seed, size=32).action)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import VecEnv
+from tqdm import TqdmExperimentalWarning
 from wpt_envs.tasks import Task
 
 from wpt_agents.dataset import TrajectoryDataset
@@ -239,20 +241,32 @@ def make_model(
 
 def _learn(job: Run, model: WPT) -> None:
     """Stage 4: fine-tuning, evaluated in between where the preset says so."""
-    preset, callback = job.preset, None
-    text = f"{preset.learn.frames:,} frames, {preset.steps:,} steps of {short_name(job.task)}"
+    frames, steps = job.preset.learn.frames, job.preset.steps
+    text = f"{frames:,} frames, {steps:,} steps of {short_name(job.task)}"
     say("learn", f"{text}, method {job.method}, seed {job.seed}")
-    model.set_logger(configure(str(job.folder), ["csv", "tensorboard"]))
-    if preset.evaluate.every:
-        callback = EvalCallback(
-            make_vec_env(job.task.id, job.shared.env, job.evaluation_seed),
-            n_eval_episodes=preset.evaluate.during_episodes,
-            eval_freq=max(1, preset.evaluate.every // preset.env.action_repeat),
+    logger = configure(str(job.folder), ["csv", "tensorboard"])
+    model.set_logger(logger)
+    with closing(logger), _evaluation(job) as callback, warnings.catch_warnings():
+        warnings.simplefilter("ignore", TqdmExperimentalWarning)  # SB3's bar is rich's
+        model.learn(steps, callback=callback, log_interval=1, progress_bar=True)
+
+
+@contextmanager
+def _evaluation(job: Run) -> Iterator[EvalCallback | None]:
+    """SB3's evaluation every so many frames, into `evaluations.npz`; None if none is wanted."""
+    given = job.preset.evaluate
+    if not given.every:
+        yield None
+        return
+    with closing(make_vec_env(job.task.id, job.shared.env, job.evaluation_seed)) as venv:
+        yield EvalCallback(
+            venv,
+            n_eval_episodes=given.during_episodes,
+            eval_freq=max(1, given.every // job.preset.env.action_repeat),
             log_path=str(job.folder),
             deterministic=True,
             verbose=0,
         )
-    model.learn(preset.steps, callback=callback, log_interval=1, progress_bar=True)
 
 
 def _evaluate(job: Run, model: WPT) -> dict[str, Score]:

@@ -8,6 +8,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from rich.console import Console
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger, configure
 from wpt_envs.tasks import Task
 
 from wpt_agents.archive import replacing
@@ -122,17 +123,18 @@ class Shared:
         state = "reused" if done.exists() else "continued" if model.exists() else "making"
         say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
         if not done.exists():
-            start = time.perf_counter()
-            WPT.pretrain(
-                dataset,
-                steps=given.steps,
-                run_dir=folder,
-                seed=given.seed,
-                device=self.device,
-                progress_bar=True,
-                callback=pretraining_log(folder),
-                **self.pretraining,
-            )
+            start, logger = time.perf_counter(), configure(str(folder), ["csv", "tensorboard"])
+            with closing(logger):
+                WPT.pretrain(
+                    dataset,
+                    steps=given.steps,
+                    run_dir=folder,
+                    seed=given.seed,
+                    device=self.device,
+                    progress_bar=True,
+                    callback=writing_to(logger),
+                    **self.pretraining,
+                )
             write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
         return model
 
@@ -163,9 +165,8 @@ BASELINES: Mapping[str, Callable[[spaces.Box, int], Policy]] = {
 }
 
 
-def pretraining_log(folder: Path) -> Callable[[int, dict[str, float]], None]:
-    """A callback that writes `progress.csv` and TensorBoard events, every 50th update."""
-    logger = configure(str(folder), ["csv", "tensorboard"])
+def writing_to(logger: Logger) -> Callable[[int, dict[str, float]], None]:
+    """A callback of pre-training that logs the metrics' means over 50 updates."""
 
     def write(step: int, metrics: dict[str, float]) -> None:
         for name, value in metrics.items():

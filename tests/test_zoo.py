@@ -1,0 +1,301 @@
+"""The runner end to end, on a toy task and the smallest networks."""
+
+import json
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import toy_env
+import yaml
+from rich.console import Console
+from scipy import stats
+from stable_baselines3.common.results_plotter import load_results, ts2xy
+from wpt_envs.tasks import TASKS, Task
+
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo import __main__ as command_line
+from wpt_agents.zoo import benchmark, report, stages
+from wpt_agents.zoo.benchmark import METHODS, Run, run
+from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate, mean_interval
+from wpt_agents.zoo.presets import Preset
+
+DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
+SECTIONS = {
+    "env": {"action_repeat": 1, "rendering": "fast"},
+    "collect": {"tasks": ["dot"], "episodes": 4},
+    "pretrain": {"steps": 2},
+    "learn": {"frames": 75},
+    "evaluate": {"episodes": 3},
+    "wpt": {
+        "size": "debug",
+        "max_action_dim": 2,
+        "batch_size": 2,
+        "batch_length": 8,
+        "train_ratio": 2,
+        "learning_starts": 25,
+        "warmup_steps": 25,
+        "num_retrieve": 3,
+        "bc_steps": 2,
+        "bc_batch_size": 4,
+    },
+}
+
+
+def make_dot(action_repeat, rendering, render_size=None, render_mode="rgb_array"):
+    return toy_env.DotEnv(render_mode)
+
+
+@pytest.fixture(autouse=True)
+def dot(monkeypatch):
+    monkeypatch.setitem(TASKS, DOT.id, DOT)
+    gym.register(DOT.id, entry_point=make_dot)
+    monkeypatch.setattr(stages.console, "_width", 160)
+    yield
+    del gym.registry[DOT.id]
+
+
+def job(tmp_path, method="wpt", seed=0, **changes):
+    sections = {title: SECTIONS[title] | changes.get(title, {}) for title in SECTIONS}
+    return Run(DOT, seed, method, "toy", Preset.of(sections), tmp_path, workers=1)
+
+
+def test_a_run_leaves_everything_in_one_folder(tmp_path):
+    one = job(tmp_path, evaluate={"every": 25, "during_episodes": 2})
+    result = run(one)
+    names = {path.name for path in one.folder.iterdir()}
+    logs = {"0.monitor.csv", "progress.csv", "evaluations.npz", "system.json", "command.txt"}
+    pictures = {"learning_curve.png", "policy.mp4", "predictions.png"}
+    assert logs | pictures | {"config.yaml", "model.zip", "result.json"} <= names
+    assert any(name.startswith("events.out.tfevents") for name in names)
+    assert list(result["scores"]) == ["nothing", "random", "prior actor", "WPT"]
+    assert all(len(score["returns"]) == 3 for score in result["scores"].values())
+    assert yaml.safe_load((one.folder / "config.yaml").read_text()) == one.config()
+    assert json.loads((one.folder / "result.json").read_text()) == result
+
+
+def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):
+    one = job(tmp_path)
+    run(one)
+    steps, _ = ts2xy(load_results(str(one.folder)), "timesteps")
+    assert steps.tolist() == [25, 50, 75]
+    assert WPT.load(one.folder / "model.zip").num_timesteps == 75
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs(tmp_path, method):
+    result = run(job(tmp_path, method))
+    assert np.isfinite(result["scores"]["WPT"]["mean"])
+    guided = method not in ("scratch", "no-guidance")
+    assert ("prior actor" in result["scores"]) == guided
+    assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
+
+
+def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
+    first = run(job(tmp_path))
+    done = (job(tmp_path).folder / "result.json").stat().st_mtime_ns
+    assert run(job(tmp_path)) == first
+    assert (job(tmp_path).folder / "result.json").stat().st_mtime_ns == done
+    monkeypatch.setattr(benchmark, "_work", lambda job: {"scores": "anew"})
+    assert run(job(tmp_path), force=True) == {"scores": "anew"}
+
+
+def test_a_second_seed_reuses_data_model_and_index_and_says_so(tmp_path, monkeypatch, capsys):
+    run(job(tmp_path))
+    capsys.readouterr()
+    monkeypatch.setattr(WPT, "pretrain", lambda *_, **__: pytest.fail("pre-trained again"))
+    monkeypatch.setattr(stages, "evaluate", lambda *_: pytest.fail("no new baseline of this seed"))
+    with pytest.raises(pytest.fail.Exception, match="baseline"):
+        run(job(tmp_path, seed=1))
+    said = capsys.readouterr().out
+    for stage in ("collect", "pretrain", "index"):
+        assert f"{stage:<10}reused" in said
+
+
+def test_a_change_of_fine_tuning_keeps_the_pretrained_model_and_others_do_not(tmp_path):
+    before = job(tmp_path).shared
+    assert job(tmp_path, wpt={"gamma": 0.9}).shared.model_path == before.model_path
+    assert job(tmp_path, wpt={"size": "tiny"}).shared.model_path != before.model_path
+    assert job(tmp_path, pretrain={"steps": 3}).shared.model_path != before.model_path
+    assert job(tmp_path, collect={"episodes": 5}).shared.model_path != before.model_path
+    assert job(tmp_path, env={"rendering": "near"}).shared.data_path != before.data_path
+
+
+def test_half_a_pretraining_is_continued(tmp_path, monkeypatch):
+    run(job(tmp_path))
+    shared = job(tmp_path).shared
+    (shared.model_path / "done.json").unlink()  # as if killed after the last checkpoint
+    monkeypatch.setattr(WPT, "_update_world_model", lambda *_: pytest.fail("from the start"))
+    shared.model(shared.data())
+    assert (shared.model_path / "done.json").exists()
+
+
+def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
+    def die(*_):
+        raise RuntimeError("out of luck")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(benchmark, "_learn", die)
+        assert not benchmark.run_all([job(tmp_path), job(tmp_path, "scratch")])
+    assert "out of luck" in (job(tmp_path).folder / "error.txt").read_text()
+    assert not (job(tmp_path).folder / "result.json").exists()
+    assert benchmark.run_all([job(tmp_path)])
+    assert not (job(tmp_path).folder / "error.txt").exists()
+
+
+def test_a_finished_run_of_other_settings_is_refused_before_any_work(tmp_path):
+    run(job(tmp_path))
+    with pytest.raises(ValueError, match=r"other settings \(wpt\).*--out"):
+        benchmark.run_all([job(tmp_path, seed=1), job(tmp_path, wpt={"gamma": 0.5})])
+    assert not job(tmp_path, seed=1).folder.exists()
+
+
+def test_a_folder_that_is_no_run_is_never_deleted(tmp_path):
+    one = job(tmp_path)
+    one.folder.mkdir(parents=True)
+    (one.folder / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match="no run folder"):
+        run(one, force=True)
+    assert (one.folder / "thesis.txt").exists()
+
+
+def test_evaluation_is_seeded_apart_from_training():
+    env = {"action_repeat": 1, "rendering": "fast"}
+    still, space = DoNothing(toy_env.DotEnv().action_space), toy_env.DotEnv().action_space
+    returns = evaluate(still, DOT.id, env, 3, seed=5).returns
+    assert returns == evaluate(still, DOT.id, env, 3, seed=5).returns
+    assert returns != evaluate(still, DOT.id, env, 3, seed=6).returns
+    assert len(set(returns)) == 3
+    noise = [evaluate(RandomPolicy(space, 1), DOT.id, env, 2, 5).returns for _ in range(2)]
+    assert noise[0] == noise[1]
+
+
+def test_doing_nothing_earns_the_first_reward_at_every_step():
+    env, steps = toy_env.DotEnv(), toy_env.LENGTH
+    env.reset(seed=5)
+    score = evaluate(
+        DoNothing(env.action_space), DOT.id, {"action_repeat": 1, "rendering": "fast"}, 1, 5
+    )
+    assert score.returns == [pytest.approx(steps * env.reward(), rel=1e-5)]
+
+
+def test_evaluations_and_training_start_from_different_seeds(tmp_path):
+    seeds = {job(tmp_path, seed=seed).evaluation_seed for seed in range(100)}
+    assert len(seeds) == 100
+    assert all(100 < seed < 2**31 - 100 for seed in seeds)
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 31, 50])
+def test_the_interval_is_students(n):
+    values = np.random.default_rng(n).normal(5, 2, n)
+    expected = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
+    assert mean_interval(values.tolist())[1:] == pytest.approx(expected, abs=2e-3)
+
+
+def test_one_value_has_no_interval():
+    assert mean_interval([3.0]) == (3.0, None, None)
+
+
+def fake_result(seed, mean, method="wpt", task="dmc-walker-run"):
+    about = {"task": task, "method": method, "preset": "paper", "seed": seed, "frames": 150_000}
+    return about | {"metric": "return", "scores": {"WPT": {"mean": mean, "success_rate": None}}}
+
+
+def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
+    for seed, mean in enumerate((700.0, 710.0, 720.0)):
+        (tmp_path / str(seed)).mkdir()
+        (tmp_path / str(seed) / "result.json").write_text(json.dumps(fake_result(seed, mean)))
+    (row,) = report.summarise(report.read_results(tmp_path))
+    # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
+    assert (row.seeds, row.mean, row.paper) == (3, 710, 728.0)
+    assert (row.low, row.high) == pytest.approx((685.2, 734.8), abs=0.1)
+
+
+def test_the_report_keeps_methods_and_budgets_apart():
+    other = fake_result(0, 1.0) | {"frames": 1}
+    rows = report.summarise([fake_result(0, 1.0), fake_result(0, 2.0, "scratch"), other])
+    assert [(row.method, row.frames) for row in rows] == [
+        ("scratch", 150_000),
+        ("wpt", 1),
+        ("wpt", 150_000),
+    ]
+
+
+def test_the_report_prints_as_table_and_as_markdown(capsys):
+    rows = report.summarise([fake_result(0, 1.234), fake_result(0, 456.7, "scratch")])
+    Console(width=200).print(report.summary_table(rows))
+    printed = capsys.readouterr().out
+    for text in (printed, report.markdown(rows)):
+        assert "1.23" in text
+        assert "457" in text
+    assert report.markdown(rows).count("\n") == 4
+
+
+def call(monkeypatch, *words):
+    """What `python -m wpt_agents.zoo WORDS` ends with: its exit code."""
+    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        command_line.main()
+    return end.value.code
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "--preset", "demmo"], "Did you mean 'demo'"),
+        (["run", "--suite", "dcm"], "Did you mean 'dmc'"),
+        (["run", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+        (["run", "--set", "gama=1"], "Did you mean 'gamma'"),
+        (["run", "--set", "learn.fames=1"], "Did you mean 'frames'"),
+        (["run", "--method", "scrath"], "Did you mean 'scratch'"),
+        (["run", "--seeds", "none"], "how many"),
+        (["run", "--tasks", "walker-run", "walker-rum"], "Did you mean 'walker-run'"),
+        (["report", "nowhere"], "No finished run below nowhere"),
+        (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
+        (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),
+        (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+    ],
+)
+def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
+    words, message, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *words) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert "Traceback" not in told
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", [[], ["list"], ["collect"], ["pretrain"], ["run"], ["report"]])
+def test_every_command_has_help(command, monkeypatch, capsys):
+    assert call(monkeypatch, *command, "--help") == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
+    assert call(monkeypatch, "list", "--suite", "dmc") == 0
+    told = capsys.readouterr().out
+    for word in ("dmc-quadruped-roll-fast", "demo", "no-rehearsal"):
+        assert word in told
+    assert "metaworld-" not in told
+
+
+def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "cheetah-*", "--seeds", "2", "--out", tmp_path / "runs"]
+    assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
+    told = capsys.readouterr().out
+    assert told.count("dmc-cheetah-run-back ") == 2
+    assert "4 episodes to collect" in told
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
+    sections = [f"{t}.{k}={json.dumps(v)}" for t in SECTIONS for k, v in SECTIONS[t].items()]
+    words = ["run", "--preset", "debug", "--tasks", "dot", "--out", tmp_path, "--workers", "1"]
+    assert call(monkeypatch, *words, "--frames", "50", "--set", *sections) == 0
+    folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"
+    assert str(folder) in capsys.readouterr().out
+    assert json.loads((folder / "result.json").read_text())["frames"] == 50
+    assert call(monkeypatch, "report", tmp_path) == 0
+    assert "dmc-dot" in capsys.readouterr().out

@@ -1,0 +1,164 @@
+import csv
+from statistics import mean, median
+
+import pytest
+
+from wpt_agents.zoo import presets
+from wpt_agents.zoo.plan import parse_seeds
+from wpt_agents.zoo.presets import load_preset, preset_folder, preset_names, read_yaml, suite_names
+from wpt_agents.zoo.tasks import find_tasks
+
+ALL = [(suite, name) for suite in suite_names() for name in preset_names(suite)]
+
+
+@pytest.mark.parametrize(("suite", "name"), ALL)
+def test_every_preset_holds_valid_keywords_and_tasks_that_exist(suite, name):
+    preset = load_preset(suite, name)
+    rows = find_tasks(suite, preset.collect.tasks)
+    assert len({row.embodiment for row in rows}) >= 2  # cross-embodiment data
+    assert preset.wpt["max_action_dim"] >= max(row.action_dim for row in rows)
+
+
+def test_the_paper_preset_is_table_2():
+    preset = load_preset("dmc", "paper")
+    table = {
+        "size": "paper",
+        "batch_size": 16,
+        "batch_length": 64,
+        "guidance": "linear(1,0,50000)",
+        "offline_ratio": 0.25,
+        "gamma": 0.99,
+        "lam": 0.95,
+        "ent_coef": 1e-4,
+        "imagine_horizon": 16,
+    }
+    assert {key: preset.wpt[key] for key in table} == table
+    assert (preset.pretrain.steps, preset.learn.frames) == (200_000, 150_000)
+    assert preset.wpt["warmup_steps"] * preset.env.action_repeat == 15_000
+
+
+def test_frames_become_calls_of_step_by_the_action_repeat():
+    assert load_preset("dmc", "debug", ["learn.frames=150_000"]).steps == 75_000
+    given = ["learn.frames=150_000", "env.action_repeat=4"]
+    assert load_preset("dmc", "debug", given).steps == 37_500
+
+
+def test_settings_change_keywords_and_sections():
+    preset = load_preset("dmc", "debug", ["gamma=0.9", "collect.tasks=[a, b]", "pretrain.steps=7"])
+    assert (preset.wpt["gamma"], preset.collect.tasks) == (0.9, ("a", "b"))
+    assert preset.pretrain.steps == 7
+
+
+def test_numbers_without_a_dot_in_the_exponent_are_numbers():
+    assert read_yaml("[1e-4, 3E+2, 4e4, -1e-3, 1_0e1]") == [1e-4, 300, 40_000, -1e-3, 100]
+
+
+def test_yaml_runs_no_code():
+    with pytest.raises(presets.yaml.YAMLError):
+        read_yaml("!!python/object/apply:os.system ['true']")
+
+
+@pytest.mark.parametrize(
+    ("suite", "name", "settings", "message"),
+    [
+        ("dmv", "demo", [], "'dmv'.*Did you mean 'dmc'"),
+        ("dmc", "demmo", [], "'demmo'.*Did you mean 'demo'"),
+        ("dmc", "demo", ["gama=0.9"], "'gama'.*Did you mean 'gamma'"),
+        ("dmc", "demo", ["learn.frame=1"], "learn key 'frame'.*Did you mean 'frames'"),
+        ("dmc", "demo", ["lern.frames=1"], "section 'lern'.*Did you mean 'learn'"),
+        ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),
+        ("dmc", "demo", ["learn.frames=many"], "learn.frames must be of type int, got 'many'"),
+        ("dmc", "demo", ["learn.frames=0"], "at least one step"),
+        ("dmc", "demo", ["seed=1"], "'seed'"),
+        ("dmc", "demo", ["gamma"], "key=value"),
+    ],
+)
+def test_what_does_not_exist_is_answered_with_the_nearest(suite, name, settings, message):
+    with pytest.raises(ValueError, match=message):
+        load_preset(suite, name, settings)
+
+
+def test_a_suite_file_with_a_wrong_key_names_it(tmp_path, monkeypatch):
+    (tmp_path / "dmc.yaml").write_text("default: {wpt: {gamme: 1}}\npresets: {demo: {}}\n")
+    monkeypatch.setattr(presets, "preset_folder", lambda: tmp_path)
+    with pytest.raises(ValueError, match=r"WPT keyword 'gamme'.*Did you mean 'gamma'"):
+        load_preset("dmc", "demo")
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3", [0, 1, 2]), ("0,5", [0, 5]), ("2-4", [2, 3, 4]), ("1,3-4", [1, 3, 4])]
+)
+def test_seeds_are_how_many_or_which(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "0", "x", "1-", "3-1"])
+def test_seeds_that_are_none_are_refused(text):
+    with pytest.raises(ValueError, match="how many"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        (["walker-run"], ["walker-run"]),
+        (["dmc-walker-run"], ["walker-run"]),
+        (["wpt/dmc-walker-run-v0"], ["walker-run"]),
+        (["acrobot-*"], ["acrobot-swingup", "acrobot-swingup-sparse", "acrobot-swingup-hard"]),
+    ],
+)
+def test_tasks_are_found_by_name_id_or_pattern(patterns, names):
+    assert [row.name for row in find_tasks("dmc", patterns)] == names
+
+
+def test_no_pattern_means_the_papers_22_tasks():
+    assert len(find_tasks("dmc", [])) == 22
+
+
+@pytest.mark.parametrize(("suite", "name"), [("dmc", "walker-rum"), ("dmd", "walker-run")])
+def test_an_unknown_task_or_suite_is_answered_with_the_nearest(suite, name):
+    with pytest.raises(ValueError, match=r"Did you mean '(walker-run|dmc)'"):
+        find_tasks(suite, [name])
+
+
+def reference(numbers, method, samples):
+    """The scores of a method's tasks, and the printed mean and median."""
+    scores, printed = [], {}
+    for number in numbers:
+        with open(preset_folder() / "references" / f"table{number}.csv") as file:
+            for row in csv.DictReader(file):
+                if (row["method"], row["samples"]) != (method, str(samples)) or not row["score"]:
+                    continue
+                if row["task"] in ("mean", "median"):
+                    printed[row["task"]] = float(row["score"])
+                else:
+                    scores.append(float(row["score"]))
+    return scores, printed
+
+
+@pytest.mark.parametrize(
+    ("method", "samples"),
+    [("wpt", 150_000), ("drq-v2", 150_000), ("dreamer-v3", 150_000), ("dreamer-v3", 500_000)],
+)
+def test_table_5_adds_up_to_its_printed_mean_and_median(method, samples):
+    scores, printed = reference([5], method, samples)
+    assert len(scores) == 22
+    assert mean(scores) == pytest.approx(printed["mean"], abs=0.01)
+    assert median(scores) == pytest.approx(printed["median"], abs=0.01)
+
+
+def test_tables_3_and_4_have_50_tasks_and_a_misprinted_mean():
+    scores, printed = reference([3, 4], "wpt", 150_000)
+    assert len(scores) == 50
+    assert mean(scores) == pytest.approx(0.7536)
+    scores, printed = reference([3, 4], "dreamer-v3", 1_000_000)
+    assert mean(scores) == pytest.approx(0.656, abs=0.001)
+    assert printed["mean"] == 0.9  # the paper's print
+
+
+def test_every_reference_names_a_task_that_exists_and_its_source():
+    for number, suite in ((3, "metaworld"), (4, "metaworld"), (5, "dmc")):
+        with open(preset_folder() / "references" / f"table{number}.csv") as file:
+            for row in csv.DictReader(file):
+                assert row["source"].endswith(f"Table {number}")
+                assert row["task"] in ("mean", "median") or find_tasks(suite, [row["task"]])

@@ -85,6 +85,26 @@ def test_the_same_rng_and_contents_draw_the_same_batch_again(tmp_path):
         np.testing.assert_array_equal(stream, tensors(two)[name])
 
 
+def test_batch_k_depends_on_seed_rank_and_k_alone(tmp_path):
+    dataset = made(tmp_path, chain(300))
+
+    def starts(rank, start):
+        batches = dataset.batches(4, 9, 2, seed=1, rank=rank, start=start)
+        found = [next(batches).image[:, 0, 0, 0, 0].tolist() for _ in range(5)]
+        batches.close()
+        return found
+
+    assert starts(0, 3)[:2] == starts(0, 0)[3:]
+    assert starts(0, 0) != starts(1, 0)
+
+
+def test_datasets_are_merged_by_extending_one(tmp_path):
+    one, other = made(tmp_path / "1", chain(9)), made(tmp_path / "2", chain(8), chain(7))
+    with one:
+        one.extend(other.subset([1]))
+    assert TrajectoryDataset.open(tmp_path / "1").lengths.tolist() == [9, 7]
+
+
 def test_lengths_widths_and_labels(tmp_path):
     dataset = made(tmp_path, chain(4, embodiment="a", task="run"), chain(9, action_dim=5))
     assert len(dataset) == 2

@@ -9,9 +9,10 @@ Example::
 """
 
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -121,6 +122,11 @@ class TrajectoryDataset:
         self._writer.append(trajectory)
         self._windows = None
 
+    def extend(self, trajectories: Iterable[Trajectory]) -> None:
+        """Adds trajectories one by one, another dataset's for example; what is added stays."""
+        for trajectory in trajectories:
+            self.append(trajectory)
+
     def flush(self) -> None:
         """Makes what was appended survive a power cut; a killed process loses nothing anyway."""
         if self._writer is not None:
@@ -197,10 +203,10 @@ class TrajectoryDataset:
         """The first image of every trajectory, in order: (n, 64, 64, 3) uint8 with n <= `batch`."""
         for at in range(0, len(self), batch):
             chunk = range(at, min(at + batch, len(self)))
-            yield np.stack([part.image[0] for part, _, _ in self._each(self._first, chunk)])
+            yield np.stack(list(self._each(self._first, chunk)))
 
-    def _first(self, i: int) -> tuple[Trajectory, int, int]:
-        return self._read((i, 0, 1))
+    def _first(self, i: int) -> np.ndarray:
+        return self._read((i, 0, 1))[0].image[0].copy()  # a view would keep its block
 
     def sample(
         self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
@@ -217,6 +223,34 @@ class TrajectoryDataset:
         rows = self._windows.draw(batch_size, length, rng)
         shape = (self.image_size, self.image_size, 3)
         return make_batch(rows, self._read, shape, action_width, self._each)
+
+    def batches(
+        self,
+        batch_size: int,
+        length: int,
+        action_width: int,
+        seed: int,
+        rank: int = 0,
+        start: int = 0,
+        ahead: int = 2,
+    ) -> Iterator[Batch]:
+        """Batches without end, from number `start`; batch k depends on (seed, rank, k) alone.
+
+        :param ahead: how many are prepared in the background
+        """
+
+        def draw(k: int) -> Batch:
+            rng = np.random.default_rng(np.random.SeedSequence([seed, rank, k]))
+            return self.sample(batch_size, length, action_width, rng)
+
+        with ThreadPoolExecutor(1, "batches") as pool:
+            waiting = deque(pool.submit(draw, k) for k in range(start, start + ahead + 1))
+            try:
+                for k in count(start + ahead + 1):
+                    yield waiting.popleft().result()
+                    waiting.append(pool.submit(draw, k))
+            finally:
+                pool.shutdown(cancel_futures=True)
 
     def info(self) -> dict[str, Any]:
         """Counts, widths, lengths and how many bytes an image takes."""

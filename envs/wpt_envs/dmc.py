@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium import spaces
 
 from wpt_envs import tasks
-from wpt_envs.rendering import Renderer  # before dm_control: it chooses the GL backend
+from wpt_envs.rendering import View  # before dm_control: it chooses the GL backend
+from wpt_envs.simulated import Simulated, StepResult
 from wpt_envs.wrappers import dress
 
 # isort: split
@@ -38,16 +39,14 @@ def make(
         env,
         image_size=image_size,
         action_repeat=action_repeat,
-        pad_action_to=tasks.suite_width("dmc") if pad_action_to == "suite" else pad_action_to,
+        pad_action_to=tasks.pad_width("dmc", pad_action_to),
         state_in_info=state_in_info,
         render_size=render_size,
     )
 
 
-class DMControl(gym.Env):
-    """One task at its control rate; observes the state, and is looked at through `look`."""
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
+class DMControl(Simulated):
+    """One task at its control rate."""
 
     def __init__(
         self,
@@ -57,13 +56,11 @@ class DMControl(gym.Env):
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        self.task, self.render_mode = task, render_mode
         self.dm_env = _load(task)
-        self.metadata = self.metadata | {"render_fps": 1 / self.dm_env.control_timestep()}
-        self._rendering = rendering
-        self._camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
-        self._renderers: dict[int, Renderer] = {}
-        self._first_seed = seed
+        super().__init__(task, seed, render_mode, fps=1 / self.dm_env.control_timestep())
+        physics = self.dm_env.physics
+        camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
+        self._view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         size = sum(int(np.prod(spec.shape)) for spec in self.dm_env.observation_spec().values())
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
@@ -71,41 +68,20 @@ class DMControl(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; a seed starts the task's random stream anew."""
-        seed = self._first_seed if seed is None else seed
-        self._first_seed = None
-        super().reset(seed=seed)
+        """Starts an episode; seed s gives the task `numpy.random.RandomState(s)`."""
+        seed = self._seeded(seed)
         if seed is not None:
             self.dm_env.task.random.seed(seed)
         timestep = self.dm_env.reset()
-        for renderer in self._renderers.values():
-            renderer.upload_terrain()
+        self._view.upload_terrain()
         return _flat(timestep.observation), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> StepResult:
         """One control step."""
         timestep = self.dm_env.step(action)
         terminated = timestep.last() and timestep.discount == 0
         truncated = timestep.last() and not terminated
         return _flat(timestep.observation), float(timestep.reward), terminated, truncated, {}
-
-    def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
-        if size not in self._renderers:
-            physics = self.dm_env.physics
-            self._renderers[size] = Renderer(
-                physics.model.ptr, physics.data.ptr, size, self._rendering, self._camera
-            )
-        return self._renderers[size].render()
-
-    def render(self) -> np.ndarray | None:
-        """The picture at 240 x 240."""
-        return None if self.render_mode is None else self.look(240)
-
-    def close(self) -> None:
-        """Frees the GL contexts."""
-        for renderer in self._renderers.values():
-            renderer.close()
 
 
 def _load(task: tasks.Task) -> Environment:

@@ -5,7 +5,8 @@ import os
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -31,7 +32,7 @@ class Quality:
     shadow_size: int | None = None  # texels of the shadow map
     tessellation: tuple[int, int, int] | None = None  # slices, stacks, quads of round shapes
     cell: float | None = None  # meshes are thinned to one vertex in a cell of this many metres
-    off: tuple[str, ...] = field(default=())
+    off: tuple[str, ...] = ()
 
 
 QUALITIES = {
@@ -66,10 +67,8 @@ class Renderer:
         camera: str | int = -1,
         flip: bool = False,
     ) -> None:
-        if rendering not in QUALITIES:
-            raise ValueError(f"No rendering {rendering!r}. There are: {', '.join(QUALITIES)}")
         self._model, self._data, self._size = model, data, size
-        self._quality = QUALITIES[rendering]
+        self._quality = _quality(rendering)
         self._camera = _camera(model, camera)
         self._flip = flip
         self._gl: Any = None
@@ -120,6 +119,55 @@ class Renderer:
             self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._finalizer = weakref.finalize(self, _free, self._gl, self._mjr, self._process)
+
+
+class View:
+    """One camera of a model at any size: a renderer for each size asked for.
+
+    :param upright: turns the picture over if the camera hangs upside down
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        rendering: str = "near",
+        camera: str | int = -1,
+        upright: bool = False,
+    ) -> None:
+        fixed = _camera(model, camera).fixedcamid
+        flip = upright and fixed >= 0 and _hangs(model, data, fixed)
+        self._new = partial(Renderer, model, data, rendering=rendering, camera=camera, flip=flip)
+        self._renderers: dict[int, Renderer] = {}
+        _quality(rendering)
+
+    def look(self, size: int) -> np.ndarray:
+        """The picture now: (size, size, 3) uint8."""
+        if size not in self._renderers:
+            self._renderers[size] = self._new(size=size)
+        return self._renderers[size].render()
+
+    def upload_terrain(self) -> None:
+        """Shows the model's height fields as they are now."""
+        for renderer in self._renderers.values():
+            renderer.upload_terrain()
+
+    def close(self) -> None:
+        """Frees the GL contexts."""
+        for renderer in self._renderers.values():
+            renderer.close()
+
+
+def _quality(rendering: str) -> Quality:
+    if rendering not in QUALITIES:
+        raise ValueError(f"No rendering {rendering!r}. There are: {', '.join(QUALITIES)}")
+    return QUALITIES[rendering]
+
+
+def _hangs(model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> bool:
+    """Whether a camera's upward axis points down."""
+    mujoco.mj_camlight(model, data)
+    return data.cam_xmat[camera].reshape(3, 3)[2, 1] < 0
 
 
 def _camera(model: mujoco.MjModel, camera: str | int) -> mujoco.MjvCamera:

@@ -91,6 +91,15 @@ def suite_width(name: str) -> int:
     return max(task.action_dim for task in suite(name, paper_only=False) if task.in_paper)
 
 
+def pad_width(suite_name: str, pad_action_to: int | str | None) -> int | None:
+    """The number behind `pad_action_to`."""
+    if pad_action_to == "suite":
+        return suite_width(suite_name)
+    if pad_action_to is None or isinstance(pad_action_to, int):
+        return pad_action_to
+    raise ValueError(f"pad_action_to={pad_action_to!r}; give a number, 'suite' or None")
+
+
 def find(suite_name: str, name: str) -> Task:
     """The row of a task; an unknown name is answered with the nearest ones."""
     task = TASKS.get(f"wpt/{suite_name}-{name}-v0")

@@ -1,0 +1,102 @@
+"""Meta-World: the 50 Sawyer tasks, with a new goal and object at each reset."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from wpt_envs import tasks
+from wpt_envs.rendering import View  # before metaworld: it chooses the GL backend
+from wpt_envs.simulated import Simulated, StepResult
+from wpt_envs.wrappers import dress
+
+# isort: split
+import mujoco
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
+
+
+def make(
+    task: str,
+    *,
+    image_size: int = 64,
+    action_repeat: int = 2,
+    pad_action_to: int | str | None = None,
+    rendering: str = "near",
+    camera: str | int = "corner4",
+    state_in_info: bool = False,
+    seed: int | None = None,
+    render_mode: str | None = "rgb_array",
+    render_size: int | None = None,
+) -> gym.Env:
+    """A task of Meta-World from pixels, for example `button-press`."""
+    env = MetaWorld(tasks.find("metaworld", task), rendering, camera, seed, render_mode)
+    return dress(
+        env,
+        image_size=image_size,
+        action_repeat=action_repeat,
+        pad_action_to=tasks.pad_width("metaworld", pad_action_to),
+        state_in_info=state_in_info,
+        render_size=render_size,
+    )
+
+
+class MetaWorld(Simulated):
+    """One task at its control rate. The state holds the goal."""
+
+    def __init__(
+        self,
+        task: tasks.Task,
+        rendering: str = "near",
+        camera: str | int = "corner4",
+        seed: int | None = None,
+        render_mode: str | None = "rgb_array",
+    ) -> None:
+        self.sawyer = _goal_observable(ALL_V3_ENVIRONMENTS[f"{task.name}-v3"]())
+        super().__init__(task, seed, render_mode, fps=1 / self.sawyer.dt)
+        self._view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)
+        self._frame, self._ever = 0, False
+        self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
+        self.observation_space = self.sawyer.sawyer_observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Draws a new goal and object; a seed starts their stream anew."""
+        seed = self._seeded(seed)
+        if seed is not None:
+            self.sawyer.seed(seed)  # its reset ignores one
+        mujoco.mj_resetData(self.sawyer.model, self.sawyer.data)  # forget the last episode wholly
+        state, _ = self.sawyer.reset()
+        mujoco.mj_forward(self.sawyer.model, self.sawyer.data)  # else the goal is drawn elsewhere
+        self._frame, self._ever = 0, False
+        return self._bounded(state), self._info(False)
+
+    def step(self, action: np.ndarray) -> StepResult:
+        """One control step; success never ends an episode."""
+        state, reward, _, _, info = self.sawyer.step(action)
+        self._frame += 1
+        truncated = self._frame >= self.task.frames
+        return self._bounded(state), float(reward), False, truncated, self._info(info["success"])
+
+    def _info(self, success: float) -> dict[str, Any]:
+        """`is_success` is `success` under the name which Stable-Baselines3 looks for."""
+        self._ever = self._ever or bool(success)
+        return {"success": bool(success), "success_any": self._ever, "is_success": bool(success)}
+
+    def _bounded(self, state: np.ndarray) -> np.ndarray:
+        return np.clip(state, self.observation_space.low, self.observation_space.high)
+
+
+def _goal_observable(sawyer: SawyerXYZEnv) -> SawyerXYZEnv:
+    """Random goals from the environment's own seed, held by the state.
+
+    Private attributes of metaworld 3.1.1, touched here and nowhere else.
+    """
+    sawyer._partially_observable = False
+    del sawyer.sawyer_observation_space  # cached while the goal was hidden; step() clips to it
+    sawyer._freeze_rand_vec = False
+    sawyer.seeded_rand_vec = True
+    sawyer._set_task_called = True
+    return sawyer

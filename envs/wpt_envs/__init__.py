@@ -5,11 +5,13 @@
 >>> obs, info = env.reset(seed=0)  # (64, 64, 3) uint8
 """
 
+from typing import Any
+
 import gymnasium
 
 from wpt_envs.tasks import ANT_SEQUENCE, TASKS, Task
 
-__all__ = ["ANT_SEQUENCE", "TASKS", "Task"]
+__all__ = ["ANT_SEQUENCE", "TASKS", "Task", "pixels"]
 
 for _task in TASKS.values():
     gymnasium.register(
@@ -17,3 +19,11 @@ for _task in TASKS.values():
         entry_point=f"wpt_envs.{_task.suite}:make",
         kwargs={"task": _task.name},
     )
+
+
+def __getattr__(name: str) -> Any:
+    if name == "pixels":  # loaded when asked for
+        from wpt_envs.any_env import pixels
+
+        return pixels
+    raise AttributeError(f"module 'wpt_envs' has no attribute {name!r}")

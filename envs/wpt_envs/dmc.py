@@ -1,5 +1,6 @@
 """DMControl: the paper's 22 tasks and the other stock tasks of their five domains."""
 
+import warnings
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -62,7 +63,10 @@ class DMControl(Simulated):
         camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
         self._view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
-        size = sum(int(np.prod(spec.shape)) for spec in self.dm_env.observation_spec().values())
+        with warnings.catch_warnings():  # quadruped looks its sensors up once, with np.in1d
+            warnings.simplefilter("ignore", DeprecationWarning)
+            specs = self.dm_env.observation_spec().values()
+        size = sum(int(np.prod(spec.shape)) for spec in specs)
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
     def reset(

@@ -23,6 +23,9 @@ _FLAGS = {
 }
 
 
+Camera = str | int | dict[str, Any]
+
+
 @dataclass(frozen=True)
 class Quality:
     """What a rendering spends. `None` keeps what the model asks for."""
@@ -54,7 +57,8 @@ class Renderer:
     The GL context is made at the first picture, so that an environment which never draws
     costs none, and is current only while it draws, so that nobody else's frames change.
 
-    :param camera: name or number of a camera of the model, -1 is the free camera
+    :param camera: name or number of a camera of the model; -1 is the free camera, and a dict
+        the free camera with these attributes, such as `distance`
     :param flip: turns the picture upside down
     """
 
@@ -64,7 +68,7 @@ class Renderer:
         data: mujoco.MjData,
         size: int = 64,
         rendering: str = "near",
-        camera: str | int = -1,
+        camera: Camera = -1,
         flip: bool = False,
     ) -> None:
         self._model, self._data, self._size = model, data, size
@@ -132,7 +136,7 @@ class View:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         rendering: str = "near",
-        camera: str | int = -1,
+        camera: Camera = -1,
         upright: bool = False,
     ) -> None:
         fixed = _camera(model, camera).fixedcamid
@@ -170,19 +174,18 @@ def _hangs(model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> bool:
     return data.cam_xmat[camera].reshape(3, 3)[2, 1] < 0
 
 
-def _camera(model: mujoco.MjModel, camera: str | int) -> mujoco.MjvCamera:
+def _camera(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
     names = [model.camera(index).name for index in range(model.ncam)]
-    if isinstance(camera, str):
-        if camera not in names:
-            raise ValueError(f"No camera {camera!r}. There are: {', '.join(names)}")
-        camera = names.index(camera)
-    if not -1 <= camera < model.ncam:
-        raise ValueError(f"No camera {camera}. There are: -1 (free), {', '.join(names)}")
     view = mujoco.MjvCamera()
-    if camera == -1:
+    if isinstance(camera, dict) or camera == -1:
         mujoco.mjv_defaultFreeCamera(model, view)
-    else:
-        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+        for name, value in (camera if isinstance(camera, dict) else {}).items():
+            setattr(view, name, value)
+        return view
+    if camera not in names and camera not in range(len(names)):
+        raise ValueError(f"No camera {camera!r}. There are: -1 (free), {', '.join(names)}")
+    view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    view.fixedcamid = names.index(camera) if isinstance(camera, str) else camera
     return view
 
 

@@ -40,6 +40,14 @@ _METAWORLD = """
 """.split()
 
 
+# Gymnasium-Robotics: embodiment -> (task, width of its actions, control steps an episode)
+_ROBOTICS = {
+    "fetch": (("reach", 4, 50), ("push", 4, 50), ("pick-and-place", 4, 50), ("slide", 4, 50)),
+    "shadow-hand": (("reach", 20, 50), ("block", 20, 100), ("egg", 20, 100), ("pen", 20, 100)),
+    "adroit": (("door", 28, 200), ("hammer", 26, 200), ("pen", 24, 200), ("relocate", 30, 200)),
+}
+
+
 @dataclass(frozen=True)
 class Task:
     """One row: a task of a suite."""
@@ -66,6 +74,10 @@ def _rows() -> list[Task]:
             rows.append(row)
     for name in _METAWORLD:
         rows.append(Task("metaworld", name, "sawyer", 4, 200, "success", True))
+    for robot, robot_tasks in _ROBOTICS.items():
+        for name, width, frames in robot_tasks:
+            row = Task("robotics", f"{robot}-{name}", robot, width, frames, "success", False)
+            rows.append(row)
     return rows
 
 
@@ -87,8 +99,8 @@ def suite(name: str, paper_only: bool = True) -> list[Task]:
 
 
 def suite_width(name: str) -> int:
-    """The width of the widest actions in a suite's paper tasks: what `pad_action_to="suite"` is."""
-    return max(task.action_dim for task in suite(name, paper_only=False) if task.in_paper)
+    """The width of a suite's widest actions: what `pad_action_to="suite"` is."""
+    return max(task.action_dim for task in suite(name, paper_only=False))
 
 
 def pad_width(suite_name: str, pad_action_to: int | str | None) -> int | None:

@@ -39,14 +39,19 @@ class PadAction(gym.ActionWrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, size: int) -> None:
         RecordConstructorArgs.__init__(self, size=size)
         gym.ActionWrapper.__init__(self, env)
-        (width,) = env.action_space.shape
+        box = env.action_space
+        if not isinstance(box, spaces.Box) or len(box.shape) != 1:
+            raise ValueError(f"Only actions in a flat Box can be padded, not in {box}")
+        (width,) = box.shape
         if size < width:
             raise ValueError(
                 f"pad_action_to={size} is narrower than the task's {width} actions; "
                 f"give {width} or more, or None"
             )
         self._width = width
-        self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+        pad = np.ones(size - width, np.float32)
+        low, high = np.concatenate([box.low, -pad]), np.concatenate([box.high, pad])
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """The entries which the environment has."""
@@ -142,4 +147,4 @@ def dress(
     env = SeePixels(env, image_size, state_in_info, render_size)
     if pad_action_to is not None:
         env = PadAction(env, pad_action_to)
-    return CheckAction(env)
+    return CheckAction(env) if isinstance(env.action_space, spaces.Box) else env

@@ -1,0 +1,108 @@
+"""Gymnasium-Robotics: Fetch, the Shadow hand and Adroit, an extra suite of further embodiments."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from wpt_envs import tasks
+from wpt_envs.rendering import View  # before gymnasium_robotics: it chooses the GL backend
+from wpt_envs.simulated import Simulated, StepResult
+from wpt_envs.wrappers import dress
+
+# isort: split
+import gymnasium_robotics
+
+_IDS = {
+    "fetch-reach": "FetchReach-v4",
+    "fetch-push": "FetchPush-v4",
+    "fetch-pick-and-place": "FetchPickAndPlace-v4",
+    "fetch-slide": "FetchSlide-v4",
+    "shadow-hand-reach": "HandReach-v3",
+    "shadow-hand-block": "HandManipulateBlock-v1",
+    "shadow-hand-egg": "HandManipulateEgg-v1",
+    "shadow-hand-pen": "HandManipulatePen-v1",
+    "adroit-door": "AdroitHandDoor-v1",
+    "adroit-hammer": "AdroitHandHammer-v1",
+    "adroit-pen": "AdroitHandPen-v1",
+    "adroit-relocate": "AdroitHandRelocate-v1",
+}
+
+
+def make(
+    task: str,
+    *,
+    image_size: int = 64,
+    action_repeat: int = 1,
+    pad_action_to: int | str | None = None,
+    rendering: str = "near",
+    camera: str | int | None = None,
+    state_in_info: bool = False,
+    seed: int | None = None,
+    render_mode: str | None = "rgb_array",
+    render_size: int | None = None,
+) -> gym.Env:
+    """A task of Gymnasium-Robotics from pixels, for example `fetch-push`."""
+    env = Robotics(tasks.find("robotics", task), rendering, camera, seed, render_mode)
+    return dress(
+        env,
+        image_size=image_size,
+        action_repeat=action_repeat,
+        pad_action_to=tasks.pad_width("robotics", pad_action_to),
+        state_in_info=state_in_info,
+        render_size=render_size,
+    )
+
+
+class Robotics(Simulated):
+    """One task at its control rate; the state is the flattened observation, goals included."""
+
+    def __init__(
+        self,
+        task: tasks.Task,
+        rendering: str = "near",
+        camera: str | int | None = None,
+        seed: int | None = None,
+        render_mode: str | None = "rgb_array",
+    ) -> None:
+        gym.register_envs(gymnasium_robotics)
+        self.robot = gym.make(_IDS[task.name], disable_env_checker=True).unwrapped
+        super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)
+        usual = self.robot.mujoco_renderer.default_cam_config
+        self._view = View(
+            self.robot.model, self.robot.data, rendering, usual if camera is None else camera
+        )
+        self._frame, self._ever = 0, False
+        self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
+        self._space = self.robot.observation_space
+        size = spaces.flatdim(self._space)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode, from the robot's own stream of goals."""
+        observation, _ = self.robot.reset(seed=self._seeded(seed))
+        self._frame, self._ever = 0, False
+        return self._state(observation), self._info(False)
+
+    def step(self, action: np.ndarray) -> StepResult:
+        """One control step; success never ends an episode."""
+        observation, reward, _, _, info = self.robot.step(action)
+        self._frame += 1
+        truncated = self._frame >= self.task.frames
+        success = info.get("is_success", info.get("success", False))
+        return self._state(observation), float(reward), False, truncated, self._info(success)
+
+    def _state(self, observation: Any) -> np.ndarray:
+        """Flattens it, and puts the goal's marker in its place whether or not anyone looks."""
+        show_goal = getattr(self.robot, "_render_callback", None)
+        if show_goal is not None:
+            show_goal()
+        return np.asarray(spaces.flatten(self._space, observation), np.float64)
+
+    def _info(self, success: float) -> dict[str, Any]:
+        """`is_success` is `success` under the name which Stable-Baselines3 looks for."""
+        self._ever = self._ever or bool(success)
+        return {"success": bool(success), "success_any": self._ever, "is_success": bool(success)}

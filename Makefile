@@ -27,18 +27,18 @@ help:
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml
-	@test -n "$(PYTHON)" || { \
-	  echo "Python 3.11 or newer is needed; found: $$(python3 --version 2>&1 || echo none)."; \
+	@test -n "$(PYTHON)" && $(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { \
+	  echo "Python 3.11 or newer is needed; found: $$($(or $(PYTHON),python3) --version 2>&1)."; \
 	  echo "Install one, or name it: make PYTHON=/path/to/python3.11"; exit 1; }
 	@echo "[install 1/4] an environment in $(VENV), from $(PYTHON) ($$($(PYTHON) --version))"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 	  echo "Could not make $(VENV). On Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
 	@echo "[install 2/4] $(TORCH) (the largest download, a few minutes)"
-	@$(PIP) install -q $(TORCH_ARGS) "$(TORCH)" || { \
+	@$(PIP) install -qq $(TORCH_ARGS) "$(TORCH)" || { \
 	  echo "              not to be had; taking the newest of $(TORCH_RANGE)"; \
-	  $(PIP) install -q $(TORCH_ARGS) "$(TORCH_RANGE)"; }
+	  $(PIP) install -qq $(TORCH_ARGS) "$(TORCH_RANGE)"; }
 	@echo "[install 3/4] wpt-agents and what it needs (simulators, Stable-Baselines3, tools)"
-	@$(PIP) install -q -e ".[dev]"
+	@$(PIP) install -qq -e ".[dev]"
 	@echo "[install 4/4] a check that the parts fit together"
 	@$(PIP) check || echo "              pip names a conflict above; going on"
 	@$(BIN)/python -c "import torch, mujoco, stable_baselines3 as sb3; print('              torch', torch.__version__ + ', mujoco', mujoco.__version__ + ', stable-baselines3', sb3.__version__)"
@@ -46,10 +46,8 @@ $(INSTALLED): pyproject.toml
 
 # The simulators draw without a display, by EGL or OSMesa. Which one is chosen, or what to install.
 rendering: $(INSTALLED)
-	@$(BIN)/python -c "import sys; from wpt_envs import headless; print('[rendering] off-screen by', headless.choose() or 'the window system')" 2>/dev/null || { \
-	  echo "No off-screen OpenGL: neither EGL nor OSMesa works on this machine. Install one:"; \
-	  echo "  apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"; \
-	  echo "  apt-get install libosmesa6"; exit 1; }
+	@$(BIN)/python -c "from wpt_envs import headless; print('[rendering] off-screen by', headless.choose() or 'the window system')" \
+	  2> $(VENV)/rendering.log || { echo "[rendering] $$(tail -n 1 $(VENV)/rendering.log)"; exit 1; }
 
 demo: rendering
 	@echo "[demo] collect, pre-train, index, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"

@@ -25,6 +25,7 @@ class Size:
     :param units: width of the heads: actor, critic, reward
     :param learning_rate: of world model and reward head
     :param actor_critic_learning_rate: of actor and critic
+    :param stabilised: DreamerV3's zero-initialised heads and normalised returns
     """
 
     deter: int
@@ -35,6 +36,7 @@ class Size:
     units: int
     learning_rate: float = 1e-4
     actor_critic_learning_rate: float = 8e-5
+    stabilised: bool = True
     blocks: int = 8
 
 
@@ -45,7 +47,7 @@ SIZES = {
     "tiny": Size(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
     "small": Size(256, 128, 16, 16, 16, 256, 6e-4, 3e-4),
     "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
-    "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5),
+    "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5, stabilised=False),
 }
 
 
@@ -126,11 +128,12 @@ class UpConv(nn.ConvTranspose2d):
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
         inputs, outputs, kernel, _ = self.weight.shape
         weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
-        phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(1, 3, 5, 0, 2, 4).flip(-1, -2)
-        bias = self.bias.repeat_interleave(4)
-        out = F.conv2d(x, phases.reshape(4 * outputs, inputs, 3, 3), bias, padding=2)
+        phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
+        out = F.conv2d(x, phases.reshape(4 * outputs, inputs, 3, 3), padding=2)
+        out = out.permute(0, 2, 3, 1).unflatten(-1, (2, 2, outputs)).transpose(2, 3)
         size = 2 * x.shape[-1] + kernel - 2
-        return F.pixel_shuffle(out, 2)[..., :size, :size]
+        out = out.flatten(3, 4).flatten(1, 2)[:, :size, :size] + self.bias
+        return out.permute(0, 3, 1, 2)
 
 
 class Decoder(nn.Module):

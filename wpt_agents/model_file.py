@@ -1,0 +1,87 @@
+"""The model file: one zip of JSON and safetensors, written whole or not at all, and no pickle."""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+from torch.optim import Optimizer
+
+from wpt_agents.archive import replacing
+
+KIND, VERSION = "wpt_agents model", 1
+ABOUT, TENSORS = "about.json", ".safetensors"
+
+
+def write_model(
+    path: str | os.PathLike[str] | BinaryIO,
+    about: Mapping[str, Any],
+    tensors: Mapping[str, Mapping[str, Tensor]],
+) -> None:
+    """Writes JSON and named groups of tensors to `path`, or to an open binary file."""
+    if isinstance(path, str | os.PathLike):
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            _write(file, about, tensors)
+    else:
+        _write(path, about, tensors)
+
+
+def _write(
+    file: BinaryIO, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        head = {"kind": KIND, "version": VERSION, **about}
+        archive.writestr(ABOUT, json.dumps(head, indent=1))
+        for name, group in tensors.items():
+            whole = {key: tensor.detach().cpu().contiguous() for key, tensor in group.items()}
+            archive.writestr(name + TENSORS, save_tensors(whole))
+
+
+def read_model(
+    path: str | os.PathLike[str] | BinaryIO,
+) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+    """Reads what `write_model` wrote, every byte checked.
+
+    :raises FileNotFoundError: no such file
+    :raises ValueError: a file that is cut short, damaged, not ours, or of a newer version
+    """
+    if isinstance(path, str | os.PathLike) and not Path(path).exists():
+        raise FileNotFoundError(f"There is no model file {path}; pass the path given to save()")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            if ABOUT not in names:
+                raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
+            about = json.loads(archive.read(ABOUT))
+            if about.get("kind") != KIND:
+                raise ValueError(f"it is a {about.get('kind')!r}")
+            if about["version"] > VERSION:
+                raise ValueError(f"it is of version {about['version']}: update wpt_agents")
+            groups = [n for n in names if n.endswith(TENSORS)]
+            tensors = {n.removesuffix(TENSORS): load_tensors(archive.read(n)) for n in groups}
+    except (zipfile.BadZipFile, json.JSONDecodeError, KeyError, EOFError, ValueError) as error:
+        raise ValueError(
+            f"{path} is no {KIND} of version {VERSION}, or is damaged ({error}); "
+            "load another copy or an earlier checkpoint"
+        ) from error
+    return about, tensors
+
+
+def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
+    """The running averages of an optimiser, by parameter number and name."""
+    state = optimizer.state_dict()["state"]
+    return {f"{i}.{key}": value for i, group in state.items() for key, value in group.items()}
+
+
+def load_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Puts what `optimizer_tensors` gave back; learning rates stay as they are."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})

@@ -1,0 +1,12 @@
+"""Errors for names that do not exist: they list the nearest that do."""
+
+import difflib
+from collections.abc import Iterable
+
+
+def unknown_name(kind: str, name: str, valid: Iterable[str]) -> ValueError:
+    """The error to raise for an unknown name: what came, and what would do."""
+    names = sorted(valid)
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
+    return ValueError(f"No {kind} {name!r}. {hint}There are: {', '.join(names)}")

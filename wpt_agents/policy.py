@@ -1,0 +1,263 @@
+"""All networks in one module, and how they act: filter a latent, then the actor decides."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from torch import Generator, Tensor, nn
+
+from wpt_agents.actor_critic import Actor, Critic
+from wpt_agents.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.networks import Size, frozen
+from wpt_agents.rssm import Latent
+from wpt_agents.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
+from wpt_agents.world_model import WorldModel
+
+IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+State = tuple[np.ndarray, ...]
+
+
+class Dream(NamedTuple):
+    """Imagined trajectories: N starts, H steps."""
+
+    states: Latent  # (N, H + 1, ...)
+    action: Tensor  # (N, H, A)
+    entropy: Tensor  # (N, H), of the actor at the steps 0 .. H-1
+    saturated: Tensor  # scalar, the share of means beyond 0.99
+
+
+def to_images(observation: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
+
+    Takes (H, W, 3) and (3, H, W), one or a batch; other sizes are resized.
+
+    :raises ValueError: anything that is no uint8 image
+    """
+    observation = np.asarray(observation)
+    batched = observation.ndim == 4
+    images = observation if batched else observation[None]
+    if images.ndim == 4 and images.shape[-1] != 3 and images.shape[1] == 3:
+        images = images.transpose(0, 2, 3, 1)
+    if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8:
+        raise ValueError(
+            f"An observation must be an image, (H, W, 3) uint8 or a batch of them, got "
+            f"{observation.shape} {observation.dtype}; render the environment to pixels"
+        )
+    if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
+        pixels = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float()
+        pixels = F.interpolate(pixels, (IMAGE_SIZE, IMAGE_SIZE), mode="bilinear", antialias=True)
+        images = pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()
+    return np.ascontiguousarray(images), batched
+
+
+class WPTPolicy(BasePolicy):
+    """World model, actor, critic, target critic and prior actor.
+
+    :param observation_space: kept as the environment has it; images are converted at the border
+    :param action_space: a Box; its width is the embodiment's own, at most `max_action_dim`
+    :param size: the widths of all networks
+    :param max_action_dim: A, the padded action width of the world model
+    :param unimix: share of the uniform in every latent distribution
+    :param zero_init_heads: start reward head and critic at zero
+    :param actor_outscale: factor on the initial weights of the actor's last layer
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        size: Size,
+        max_action_dim: int,
+        unimix: float = 0.01,
+        zero_init_heads: bool = False,
+        actor_outscale: float = 1.0,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        self.size, self.max_action_dim = size, max_action_dim
+        self.zero_init_heads, self.actor_outscale = zero_init_heads, actor_outscale
+        self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
+        self.reset_behavior()
+        self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
+        self.register_buffer("return_scale", torch.ones(()))
+        self.generator: Generator | None = None
+        self.set_action_space(action_space)
+
+    def reset_behavior(self) -> None:
+        """Draws all that belongs to a task anew: reward head, actor, critic, prior actor."""
+        size, device = self.size, self.device
+        fresh = WorldModel(size, self.max_action_dim, zero_init_heads=self.zero_init_heads)
+        self.world_model.reward_head.load_state_dict(fresh.reward_head.state_dict())
+        self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
+        self.critic = Critic(size, self.zero_init_heads).to(device)
+        self.target_critic = Critic(size).to(device).requires_grad_(False)
+        self.target_critic.load_state_dict(self.critic.state_dict())
+        self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
+
+    def set_action_space(self, action_space: spaces.Box) -> None:
+        """Acts in this space from now on; entries past its width are masked everywhere."""
+        self.action_space = action_space
+        self.action_mask[:] = torch.arange(self.max_action_dim) < action_space.shape[0]
+
+    def initial_state(self, n: int) -> State:
+        """The acting state of n fresh episodes: h (n, D), z (n, S, K), previous action (n, A)."""
+        shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
+        return tuple(np.zeros(s, np.float32) for s in (*shapes, (n, self.max_action_dim)))
+
+    @torch.no_grad()
+    def act(
+        self,
+        image: np.ndarray,
+        state: State | None,
+        episode_start: np.ndarray | None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """One step of filtering and acting.
+
+        :param image: (n, 64, 64, 3) uint8
+        :param state: from the step before, or None
+        :param episode_start: (n,) bool, where the state is reset
+        :param deterministic: take the likeliest latent and the mean action
+        :return: action (n, A) in [-1, 1], zero in the padding, and the new state
+        """
+        n = len(image)
+        deter, stoch, action = (self._tensor(x) for x in state or self.initial_state(n))
+        first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
+        embed = self.world_model.encoder(self._tensor(image))
+        post, _, _ = self.world_model.rssm.observe(
+            embed[:, None],
+            action[:, None],
+            self._tensor(first)[:, None],
+            Latent(deter, stoch),
+            self.generator,
+            sample=not deterministic,
+        )
+        dist = self.actor.dist(post.feat[:, 0], self.action_mask)
+        action = dist.mode if deterministic else dist.rsample(self.generator)
+        if not torch.isfinite(action).all():
+            raise ValueError("The actor's output is not finite: the weights are damaged")
+        return action.cpu().numpy(), tuple(
+            x.cpu().numpy() for x in (post.deter[:, 0], post.stoch[:, 0], action)
+        )
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(array)).to(self.device)
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
+        low, high = self.action_space.low, self.action_space.high
+        own = action[:, : len(low)].clip(-1, 1)
+        return (low + 0.5 * (own + 1) * (high - low)).astype(self.action_space.dtype)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """The action in the environment's own space, and the recurrent state to hand back.
+
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
+            are converted
+        :param state: what the last call returned; None at the start
+        :param episode_start: (n,) bool, where an episode begins; None for nowhere
+        """
+        images, batched = to_images(observation)
+        action, state = self.act(images, state, episode_start, deterministic)
+        action = self.to_env(action)
+        return (action if batched else action[0]), state
+
+    def _predict(self, observation: Tensor, deterministic: bool = False) -> Tensor:
+        """SB3's stateless form: every observation is taken for an episode's first."""
+        images, _ = to_images(observation.cpu().numpy())
+        return self._tensor(self.to_env(self.act(images, None, None, deterministic)[0]))
+
+    def dream(self, start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
+        """Imagines with the actor in the frozen world model; gradients run through the dynamics.
+
+        :param start: (N, ...), the states to start from
+        """
+        entropies, saturated = [], []
+
+        def policy(state: Latent, _: int) -> Tensor:
+            dist = self.actor.dist(state.feat.detach(), self.action_mask)
+            entropies.append(dist.entropy())
+            saturated.append((dist.mean.detach().abs() > 0.99)[..., self.action_mask].float())
+            return dist.rsample(generator)
+
+        with frozen(self.world_model):
+            states, action = self.world_model.rssm.imagine(
+                start.detach(), policy, horizon, generator
+            )
+        return Dream(states, action, torch.stack(entropies, 1), torch.stack(saturated).mean())
+
+    @torch.no_grad()
+    def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
+        """What the world model expects to see: `context` reconstructions, then a dream.
+
+        :return: (context + horizon or the trajectory's images, 64, 64, 3) uint8
+        """
+        stop = min(context + horizon, len(trajectory) + 1)
+        batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)])
+        frames = self.world_model.open_loop(batch.to(self.device), context, self.generator)
+        return frames[0].cpu().numpy()
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **super()._get_constructor_parameters(),
+            "size": self.size,
+            "max_action_dim": self.max_action_dim,
+        }
+
+
+class PriorPolicy:
+    """The prior actor by SB3's `predict`; its state is the last three images."""
+
+    def __init__(self, policy: WPTPolicy) -> None:
+        self.policy = policy
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, State]:
+        """As `WPTPolicy.predict`; the clone has no noise to leave out."""
+        images, batched = to_images(observation)
+        frames = stack_frames(images, state[0] if state else None, episode_start)
+        action = self.policy.to_env(prior_action(self.policy, frames))
+        return (action if batched else action[0]), (frames,)
+
+
+def stack_frames(
+    image: np.ndarray, frames: np.ndarray | None, episode_start: np.ndarray | None
+) -> np.ndarray:
+    """The last three images of n episodes, the first one repeated where an episode begins.
+
+    :param image: (n, 64, 64, 3), the newest
+    :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
+    :param episode_start: (n,) bool
+    """
+    fresh = np.repeat(image[:, None], FRAMES, 1)
+    if frames is None:
+        return fresh
+    moved = np.concatenate([frames[:, 1:], image[:, None]], 1)
+    if episode_start is None:
+        return moved
+    return np.where(np.asarray(episode_start, bool)[:, None, None, None, None], fresh, moved)
+
+
+@torch.no_grad()
+def prior_action(policy: WPTPolicy, frames: np.ndarray) -> np.ndarray:
+    """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
+    images = torch.from_numpy(frames).to(policy.device)
+    return policy.prior_actor.act(images, policy.action_mask).cpu().numpy()
+
+
+def parameters(*modules: nn.Module) -> list[nn.Parameter]:
+    """The trainable parameters of several modules."""
+    return [p for m in modules for p in m.parameters() if p.requires_grad]

@@ -1,0 +1,104 @@
+"""The open episodes of n environments: what is being recorded, and who drives."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wpt_agents.policy import State, WPTPolicy, prior_action, stack_frames
+from wpt_agents.trajectory import Trajectory
+
+Window = tuple[int, int]
+
+
+class Rollout:
+    """Records steps until an episode ends, and lets the prior actor drive inside its window.
+
+    :param policy: acts
+    :param n_envs: how many episodes are open at once
+    :param draw: called when an episode begins; the steps (start, stop) at which the guide drives
+    :param embodiment: written on each trajectory
+    """
+
+    def __init__(
+        self,
+        policy: WPTPolicy,
+        n_envs: int,
+        draw: Callable[[], Window],
+        embodiment: str | None = None,
+    ) -> None:
+        self.policy, self.draw, self.embodiment = policy, draw, embodiment
+        self.state: State = policy.initial_state(n_envs)
+        self.frames: np.ndarray | None = None
+        self.first = np.ones(n_envs, bool)
+        self.windows: list[Window] = [(0, 0)] * n_envs
+        self.images: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
+        self.actions: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
+        self.rewards: list[list[float]] = [[] for _ in range(n_envs)]
+        self.guided_steps = 0
+
+    def act(self, image: np.ndarray, guide: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """One action per environment; the latent is filtered whoever drives.
+
+        :param image: (n, 64, 64, 3) uint8
+        :param guide: (k, F, 64, 64, 3) frames -> (k, A), the prior actor
+        :return: (n, A) in [-1, 1]
+        """
+        for i in np.flatnonzero(self.first):
+            self.windows[i] = self.draw()
+        self.frames = stack_frames(image, self.frames, self.first)
+        action, state = self.policy.act(image, self.state, self.first)
+        time = np.array([len(actions) for actions in self.actions])
+        start, stop = np.array(self.windows).T
+        guided = (start <= time) & (time < stop)
+        if guided.any():
+            action[guided] = guide(self.frames[guided])
+        self.guided_steps += int(guided.sum())
+        self.state = (state[0], state[1], action)
+        for i, (frame, each) in enumerate(zip(image, action, strict=True)):
+            self.images[i].append(frame.copy())
+            self.actions[i].append(each[: self.policy.action_space.shape[0]].copy())
+        return action
+
+    def end_step(
+        self, reward: np.ndarray, done: np.ndarray, last: dict[int, tuple[np.ndarray, bool]]
+    ) -> list[Trajectory]:
+        """Takes in the step's outcome; returns the episodes that it ended.
+
+        :param reward: (n,)
+        :param done: (n,) bool
+        :param last: for each ended episode its last image (64, 64, 3) and whether it terminated
+        """
+        finished = []
+        for i, each in enumerate(reward):
+            self.rewards[i].append(float(each))
+            if done[i]:
+                image, terminated = last[i]
+                finished.append(self._finish(i, image, terminated))
+        self.first = done.copy()
+        return finished
+
+    def _finish(self, i: int, image: np.ndarray, terminated: bool) -> Trajectory:
+        trajectory = Trajectory(
+            np.stack([*self.images[i], image]),
+            np.stack(self.actions[i]).astype(np.float32),
+            np.array(self.rewards[i], np.float32),
+            terminated,
+            embodiment=self.embodiment,
+        )
+        self.images[i], self.actions[i], self.rewards[i] = [], [], []
+        return trajectory
+
+
+def clone_guide(policy: WPTPolicy) -> Callable[[np.ndarray], np.ndarray]:
+    """The prior actor as a guide."""
+    return lambda frames: prior_action(policy, frames)
+
+
+def random_guide(policy: WPTPolicy, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """Uniform random actions, for the warm-up where there is no clone."""
+    mask = policy.action_mask.cpu().numpy()
+
+    def guide(frames: np.ndarray) -> np.ndarray:
+        return (rng.uniform(-1, 1, (len(frames), len(mask))) * mask).astype(np.float32)
+
+    return guide

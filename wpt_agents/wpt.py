@@ -1,0 +1,863 @@
+"""Algorithm 1: pre-train on reward-free data, then retrieve, clone, collect and update.
+
+Example::
+
+    model = WPT.pretrain("data/dmc", steps=200_000)
+    model.set_env("wpt/dmc-walker-run-v0")
+    model.learn(75_000)
+    action, state = model.predict(obs, state, episode_start, deterministic=True)
+"""
+
+import hashlib
+import inspect
+import os
+import tempfile
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from torch import Generator, Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW, Optimizer
+from tqdm.auto import tqdm
+
+from wpt_agents.actor_critic import (
+    actor_loss,
+    critic_loss,
+    ema_update,
+    lambda_return,
+    return_range,
+)
+from wpt_agents.behavior_cloning import FRAMES, bc_loss, random_shift
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.guidance import draw_window, parse_schedule
+from wpt_agents.model_file import load_optimizer, optimizer_tensors, read_model, write_model
+from wpt_agents.names import unknown_name
+from wpt_agents.networks import SIZES, frozen
+from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, State, WPTPolicy, to_images
+from wpt_agents.replay import ReplayBuffer, mix
+from wpt_agents.retrieval import Retriever
+from wpt_agents.rollout import Rollout, clone_guide, random_guide
+from wpt_agents.rssm import Latent
+from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
+from wpt_agents.world_model import reward_loss, world_model_update_loss
+
+Data = str | os.PathLike[str] | TrajectoryDataset | Iterable[Trajectory]
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT = range(6)  # purposes of random streams
+EVERY = 1000  # pre-training steps between checkpoints
+
+
+class WPT(BaseAlgorithm):
+    """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
+
+    Example::
+
+        model = WPT.pretrain("data/dmc", size="small", steps=20_000)
+        model.set_env("wpt/dmc-walker-run-v0")
+        model.learn(75_000).save("walker.zip")
+
+    Without pre-training and dataset, `WPT("WPTPolicy", env)` learns from scratch. The defaults are
+    Table 2 of the paper; steps are calls of `env.step` (2 frames each at action repeat 2).
+
+    :param policy: "WPTPolicy"
+    :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
+    :param size: the widths of all networks: debug, tiny, small, medium or paper
+    :param dataset: D_off, for rehearsal and guidance: a store's path, a TrajectoryDataset or
+        trajectories
+    :param max_action_dim: A, the width that all actions are padded to
+    :param embodiment: the robot's name; retrieval keeps to data that bears it
+    :param batch_size: sequences in a batch
+    :param batch_length: images in a sequence
+    :param learning_rate: of world model and reward head; the size's own if None
+    :param actor_critic_learning_rate: of actor and critic; the size's own if None
+    :param weight_decay: share by which every weight shrinks in a step
+    :param grad_clip: largest gradient norm, for each network
+    :param gamma: the discount
+    :param lam: λ of Eq. (2)
+    :param ent_coef: η of Eq. (4)
+    :param imagine_horizon: H, imagined steps
+    :param target_fraction: how far the target critic moves at an update
+    :param dyn_scale: weight of the KL that teaches the prior
+    :param rep_scale: weight of the KL that teaches the posterior
+    :param free_nats: KL below which it teaches nothing
+    :param free_nats_mode: "mean" (WPT) or "element" (DreamerV3)
+    :param unimix: share of the uniform in the latents' distributions
+    :param zero_init_heads: start reward head and critic at zero; the size's own if None
+    :param return_norm: divide returns by their 5-95 % range, if above 1; the size's own if None
+    :param actor_outscale: factor on the initial weights of the actor's last layer
+    :param train_ratio: replayed steps per collected step; one update replays B x T
+    :param learning_starts: steps collected before the first update
+    :param warmup_steps: steps driven by the prior actor alone (uniform random without one)
+    :param offline_ratio: share of retrieved sequences in a batch; 0: no rehearsal
+    :param guidance: schedule of the probability that an episode is guided; 0: none
+    :param episode_length: steps of an episode, for the guidance window; found out if None
+    :param num_retrieve: R, trajectories to retrieve
+    :param bc_steps: updates of the prior actor
+    :param bc_batch_size: pairs in each
+    :param bc_learning_rate: of the prior actor
+    :param precision: "fp32", or "bf16" for the forward passes
+    :param tensorboard_log: folder of the TensorBoard events
+    :param verbose: 0 nothing, 1 information
+    :param seed: of everything that is drawn
+    :param device: "auto", "cpu", "cuda", ...
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"WPTPolicy": WPTPolicy}
+    policy: WPTPolicy
+
+    def __init__(
+        self,
+        policy: str | type[WPTPolicy] = "WPTPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        size: str = "paper",
+        dataset: Data | None = None,
+        max_action_dim: int = 12,
+        embodiment: str | None = None,
+        batch_size: int = 16,
+        batch_length: int = 64,
+        learning_rate: float | None = None,
+        actor_critic_learning_rate: float | None = None,
+        weight_decay: float = 1e-6,
+        grad_clip: float = 100.0,
+        gamma: float = 0.99,
+        lam: float = 0.95,
+        ent_coef: float = 1e-4,
+        imagine_horizon: int = 16,
+        target_fraction: float = 0.02,
+        dyn_scale: float = 1.0,
+        rep_scale: float = 0.1,
+        free_nats: float = 1.0,
+        free_nats_mode: str = "mean",
+        unimix: float = 0.01,
+        zero_init_heads: bool | None = None,
+        return_norm: bool | None = None,
+        actor_outscale: float = 1.0,
+        train_ratio: float = 256,
+        learning_starts: int = 5_000,
+        warmup_steps: int = 7_500,
+        offline_ratio: float = 0.25,
+        guidance: str | float = "linear(1,0,50000)",
+        episode_length: int | None = None,
+        num_retrieve: int = 500,
+        bc_steps: int = 150_000,
+        bc_batch_size: int = 256,
+        bc_learning_rate: float = 1e-4,
+        precision: str = "fp32",
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        given = {k: v for k, v in locals().items() if k in HYPERPARAMETERS}
+        self.hyperparameters = given
+        if size not in SIZES:
+            raise unknown_name("size", size, SIZES)
+        if precision not in ("fp32", "bf16"):
+            raise unknown_name("precision", precision, ("fp32", "bf16"))
+        for name, value in given.items():
+            setattr(self, name, value)
+        super().__init__(
+            policy,
+            None,
+            learning_rate=learning_rate or SIZES[size].learning_rate,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            support_multi_env=True,
+        )
+        self.hyperparameters["seed"] = seed
+        self.stream_seed = int(np.random.SeedSequence().entropy % 2**31) if seed is None else seed
+        self.observation_space, self.n_envs = IMAGE_SPACE, 1
+        self.action_space = spaces.Box(-1.0, 1.0, (max_action_dim,), np.float32)
+        self.schedule = parse_schedule(guidance)
+        self.dataset: TrajectoryDataset | None = None
+        self.replay_buffer = ReplayBuffer()
+        self.retrieved: ReplayBuffer | None = None
+        self.retrieved_ids: list[int] = []
+        self.cloned, self.episodes, self.updates, self.credit = False, 0, 0, 0.0
+        self._rollout: Rollout | None = None
+        if _init_setup_model:
+            self._setup_model()
+        self.set_dataset(dataset)
+        if env is not None:
+            self.set_env(env)
+
+    def _setup_model(self) -> None:
+        self.set_random_seed(self.seed)
+        size = SIZES[self.size]
+        small = size.stabilised
+        self.return_norm = small if self.return_norm is None else self.return_norm
+        zero = small if self.zero_init_heads is None else self.zero_init_heads
+        self.policy = self.policy_class(
+            self.observation_space,
+            self.action_space,
+            size,
+            self.max_action_dim,
+            self.unimix,
+            zero,
+            self.actor_outscale,
+        ).to(self.device)
+        self.policy.generator = Generator(self.device).manual_seed(self.stream_seed)
+        self._setup_optimizers()
+
+    def _setup_optimizers(self) -> None:
+        policy, model_rate = self.policy, float(self.learning_rate)
+        rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
+        self.model_optimizer = self._optimizer(policy.world_model, model_rate)
+        self.actor_optimizer = self._optimizer(policy.actor, rate)
+        self.critic_optimizer = self._optimizer(policy.critic, rate)
+
+    def _optimizer(self, module: torch.nn.Module, rate: float) -> Optimizer:
+        decay = self.weight_decay / rate  # AdamW multiplies it with the rate again
+        return AdamW(module.parameters(), rate, eps=1e-5, weight_decay=decay, fused=True)
+
+    # ------------------------------------------------------------------ the data and the task
+
+    def set_dataset(self, dataset: Data | None) -> None:
+        """Takes D_off: a store's path, a TrajectoryDataset, or trajectories (stored aside)."""
+        if dataset is None:
+            return
+        if isinstance(dataset, str | os.PathLike):
+            dataset = TrajectoryDataset.open(dataset)
+        elif not isinstance(dataset, TrajectoryDataset):
+            self._scratch = tempfile.TemporaryDirectory(prefix="wpt_dataset_")
+            with TrajectoryDataset.create(Path(self._scratch.name) / "data") as store:
+                for trajectory in dataset:
+                    store.append(trajectory)
+            dataset = TrajectoryDataset.open(store.path)
+        _check_dataset(dataset, self.max_action_dim, self.batch_length)
+        self.dataset = dataset
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        given = env if isinstance(env, VecEnv) else None
+        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if wrapped is not given and isinstance(wrapped, VecTransposeImage):
+            return wrapped.venv  # images stay (H, W, 3) until the networks
+        return wrapped
+
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
+        """Takes another environment, with any number of copies and any allowed action width.
+
+        What the replay buffer holds of a robot with another action width is dropped, and so are
+        reward head, actor, critic and prior actor; the world model stays.
+
+        :raises ValueError: observations that are no images, actions that are no bounded Box or
+            are wider than `max_action_dim`
+        """
+        wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
+        _check_spaces(wrapped, self.max_action_dim)
+        if self.episodes and wrapped.action_space.shape != self.action_space.shape:
+            self.reset_task()
+        self.env, self.n_envs = wrapped, wrapped.num_envs
+        self.observation_space, self.action_space = wrapped.observation_space, wrapped.action_space
+        self.policy.observation_space = wrapped.observation_space
+        self.policy.set_action_space(wrapped.action_space)
+        if force_reset:
+            self._last_obs = None
+        self._rollout = None
+        if self.seed is not None:
+            wrapped.seed(self.seed)
+
+    def reset_task(self) -> None:
+        """Forgets the task and keeps the world model: replay, rewards, behaviour, retrieval."""
+        self.replay_buffer, self.retrieved, self.retrieved_ids = ReplayBuffer(), None, []
+        self.cloned, self.credit = False, 0.0
+        self.policy.reset_behavior()
+        self._setup_optimizers()
+
+    # ------------------------------------------------- // Task-Agnostic World Model Pre-Training
+
+    @classmethod
+    def pretrain(
+        cls,
+        dataset: Data,
+        env: GymEnv | str | None = None,
+        steps: int = 200_000,
+        size: str = "paper",
+        run_dir: str | os.PathLike[str] | None = None,
+        seed: int | None = None,
+        progress_bar: bool = False,
+        callback: Callable[[int, dict[str, float]], Any] | None = None,
+        **kwargs: Any,
+    ) -> "WPT":
+        """Trains a world model on reward-free trajectories of any embodiments, by Eq. (1).
+
+        :param dataset: a store's path, a TrajectoryDataset, or trajectories
+        :param env: the environment to go on with, if known
+        :param steps: updates
+        :param run_dir: `model.zip` is written there every 1000 steps and at the end; if it is
+            there already, training goes on from it
+        :param callback: called after every update with (step, metrics)
+        :param kwargs: keywords of `WPT`
+        :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
+            with other images or wider actions; an unknown keyword
+        """
+        cls._check_keywords(kwargs)
+        model = cls(size=size, seed=seed, **kwargs)
+        model.set_dataset(dataset)
+        path = Path(run_dir) / "model.zip" if run_dir is not None else None
+        if path is not None and path.exists():
+            model._restore(path, ("size", "max_action_dim", "batch_size", "batch_length"))
+        model._pretrain(steps, path, progress_bar, callback)
+        if env is not None:
+            model.set_env(env)
+        return model
+
+    def _pretrain(
+        self,
+        steps: int,
+        path: Path | None,
+        progress_bar: bool,
+        callback: Callable[[int, dict[str, float]], Any] | None,
+    ) -> None:
+        assert self.dataset is not None
+        done = self.updates
+        bar = tqdm(total=steps, initial=done, desc="pre-train", disable=not progress_bar)
+        with bar:
+            for step in range(done, steps):
+                rng = self._stream(PRETRAIN, step)
+                batch = self.dataset.sample(
+                    self.batch_size, self.batch_length, self.max_action_dim, rng
+                ).to(self.device)
+                metrics: dict[str, list[Tensor]] = defaultdict(list)
+                self._update_world_model(batch, metrics)
+                self.updates = step + 1
+                if callback is not None:
+                    callback(self.updates, {k: float(v[0]) for k, v in metrics.items()})
+                if step % 20 == 0:
+                    loss = float(metrics["train/reconstruction_loss"][0])
+                    bar.set_postfix(reconstruction=f"{loss:.1f}")
+                bar.update()
+                if path is not None and (self.updates % EVERY == 0 or self.updates == steps):
+                    self.save(path)
+        self.updates = 0
+
+    # ----------------------------------------------------------------- // Task-Specific Training
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "WPT",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> "WPT":
+        """Algorithm 1 from its second heading on: retrieve, clone, then collect and update.
+
+        :param total_timesteps: calls of `env.step`, a lower bound
+        :param callback: SB3's callbacks
+        :param log_interval: episodes between two dumps of the log
+        :return: itself
+        """
+        if self.env is None:
+            raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        try:
+            self._retrieve(progress_bar)
+            self._clone(progress_bar)
+            while self.num_timesteps < total_timesteps:
+                if not self._collect(callback, log_interval):
+                    break
+                self._update_models()
+        finally:
+            callback.on_training_end()
+        return self
+
+    def _retrieve(self, progress_bar: bool) -> None:
+        """// Experience Retrieval: the R trajectories that begin most like the task, Eq. (5)."""
+        guided = parse_schedule(self.guidance)(0) > 0
+        if self.dataset is None or self.retrieved is not None or not (guided or self.offline_ratio):
+            return
+        if not self.retrieved_ids:
+            query = self.embed(to_images(self._last_obs)[0][:1])[0]
+            self.retrieved_ids = self._search(query, progress_bar)
+        self.retrieved = ReplayBuffer()
+        for trajectory in self.dataset.subset(self.retrieved_ids):
+            self.retrieved.add(replace(trajectory, reward=None))
+
+    def _search(self, query: np.ndarray, progress_bar: bool) -> list[int]:
+        assert self.dataset is not None
+        width, retriever = self.action_space.shape[0], self.build_index(progress_bar)
+        known = self.embodiment if self.embodiment in self.dataset.embodiments else None
+        found, _ = retriever.search(query, self.num_retrieve, known, width)
+        if len(found) == 0:
+            raise ValueError(
+                f"The dataset {self.dataset.path} has no trajectory of {width} actions to "
+                "retrieve; add some, or learn with offline_ratio=0, guidance=0"
+            )
+        return [int(i) for i in found]
+
+    def build_index(self, progress_bar: bool = False) -> Retriever:
+        """The index over the dataset's first images by this encoder, kept beside the dataset."""
+        assert self.dataset is not None
+        encoder_id = self.encoder_id()
+        path = Path(self.dataset.path) / f"retrieval-{encoder_id[:12]}.index"
+        if path.exists():
+            retriever = Retriever.load(path, encoder_id)
+            if len(retriever) == len(self.dataset):
+                return retriever
+        retriever = Retriever.build(self.dataset, self.embed, encoder_id, progress_bar)
+        retriever.save(path)
+        return retriever
+
+    @torch.no_grad()
+    def embed(self, image: np.ndarray) -> np.ndarray:
+        """e(o) of Eq. (5): (n, 64, 64, 3) uint8 -> (n, E) float32."""
+        images = torch.from_numpy(image).to(self.device)
+        return self.policy.world_model.encoder(images).float().cpu().numpy()
+
+    def encoder_id(self) -> str:
+        """A hash of the encoder's weights."""
+        digest = hashlib.sha256()
+        for tensor in self.policy.world_model.encoder.state_dict().values():
+            digest.update(tensor.cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    def _clone(self, progress_bar: bool) -> None:
+        """// Behavior Cloning Policy Training, on the retrieved trajectories."""
+        if self.retrieved is None or self.cloned or parse_schedule(self.guidance)(0) == 0:
+            return
+        policy, width = self.policy, self.max_action_dim
+        optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
+        for step in tqdm(range(self.bc_steps), desc="clone", disable=not progress_bar):
+            generator = self._generator(CLONE, step)
+            rng = self._stream(CLONE, step)
+            batch = self.retrieved.sample(self.bc_batch_size, FRAMES + 1, width, rng)
+            batch = batch.to(self.device)
+            with self._autocast():
+                frames = random_shift(batch.image[:, :FRAMES], generator=generator)
+                # the action that led to image F was taken at image F - 1, the last one shown
+                loss = bc_loss(
+                    policy.prior_actor(frames), batch.action[:, FRAMES], policy.action_mask
+                )
+            self._descend(optimizer, loss, "bc")
+        self.cloned = True
+
+    # ------------------------------------------------------------------------- // Collect Data
+
+    def _collect(self, callback: Any, log_interval: int) -> bool:
+        """Steps all environments until an episode ends; False when a callback says stop."""
+        assert self.env is not None
+        rollout = self._open_rollout()
+        callback.on_rollout_start()
+        ended = False
+        while not ended and self.num_timesteps < self._total_timesteps:
+            image, _ = to_images(self._last_obs)
+            action = rollout.act(image, self._guide())
+            new_obs, rewards, dones, infos = self.env.step(self.policy.to_env(action))
+            _check_rewards(rewards, self.num_timesteps)
+            self.num_timesteps += self.n_envs
+            if self.num_timesteps > self.learning_starts:
+                self.credit += self.n_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            for trajectory in rollout.end_step(rewards, dones, _last_images(infos, dones)):
+                self.replay_buffer.add(trajectory)
+                self.episode_length = len(trajectory)
+                self.episodes += 1
+                self._log_episodes(log_interval)
+            self._last_obs, self._last_episode_starts = new_obs, dones
+            ended = bool(dones.any())
+        callback.on_rollout_end()
+        return True
+
+    def _open_rollout(self) -> Rollout:
+        if self._rollout is None or self._last_episode_starts.all():
+            self._rollout = Rollout(self.policy, self.n_envs, self._draw_window, self.embodiment)
+            generator = self.policy.generator
+            generator.manual_seed(_torch_seed(self._stream(ACT, self.episodes)))
+        return self._rollout
+
+    def _draw_window(self) -> tuple[int, int]:
+        """Decides at an episode's start whether, and when, the prior actor drives."""
+        length = self._episode_length()
+        if self.num_timesteps < self.warmup_steps:
+            return 0, length
+        probability = self.schedule(self.num_timesteps) if self.cloned else 0.0
+        self._windows_drawn = getattr(self, "_windows_drawn", 0) + 1
+        return draw_window(probability, length, self._stream(WINDOW, self._windows_drawn))
+
+    def _episode_length(self) -> int:
+        if self.episode_length is None:
+            assert self.env is not None
+            spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+            self.episode_length = getattr(spec, "max_episode_steps", None) or 500
+        return self.episode_length
+
+    def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
+        if self.cloned:
+            return clone_guide(self.policy)
+        return random_guide(self.policy, self._stream(WARMUP, self.num_timesteps))
+
+    # ------------------------------------------------------------------------ // Update Models
+
+    def _update_models(self) -> None:
+        """The gradient steps that the collected steps have earned."""
+        if not self.replay_buffer.trajectories:
+            return
+        per_update = self.batch_size * self.batch_length
+        updates = int(self.credit * self.train_ratio / per_update)
+        self.credit -= updates * per_update / self.train_ratio
+        metrics: dict[str, list[Tensor]] = defaultdict(list)
+        for _ in range(updates):
+            self.update(metrics)
+        for key, values in metrics.items():
+            self.logger.record_mean(key, torch.stack(values).mean().item())
+
+    def update(self, metrics: dict[str, list[Tensor]]) -> None:
+        """One gradient step of every network on a mixed batch; appends to `metrics`."""
+        generator = self._generator(UPDATE, self.updates)
+        batch = mix(
+            self.replay_buffer,
+            self.retrieved,
+            self.offline_ratio,
+            self.batch_size,
+            self.batch_length,
+            self.max_action_dim,
+            self._stream(UPDATE, self.updates),
+        ).to(self.device)
+        post = self._update_world_model(batch, metrics, generator, learn_reward=True)
+        self._update_behavior(post.flatten_time(), metrics, generator)
+        self.updates += 1
+
+    def _update_world_model(
+        self,
+        batch: Any,
+        metrics: dict[str, list[Tensor]],
+        generator: Generator | None = None,
+        learn_reward: bool = False,
+    ) -> Latent:
+        """Eq. (1), and the reward likelihood on states cut off from the world model."""
+        model = self.policy.world_model
+        generator = generator or self._generator(PRETRAIN, self.updates)
+        with self._autocast():
+            loss, post = world_model_update_loss(
+                model,
+                batch,
+                generator,
+                dyn_scale=self.dyn_scale,
+                rep_scale=self.rep_scale,
+                free_nats=self.free_nats,
+                free_nats_mode=self.free_nats_mode,
+            )
+            total = loss.total
+            if learn_reward:
+                logits = model.reward_head(post.feat.detach())
+                reward = reward_loss(logits, batch.reward, batch.reward_known)
+                total = total + reward
+                metrics["train/reward_loss"].append(reward.detach())
+        norm = self._descend(self.model_optimizer, total, "world model")
+        metrics["train/reconstruction_loss"].append(loss.reconstruction.detach())
+        metrics["train/kl"].append(loss.kl)
+        metrics["train/world_model_grad_norm"].append(norm)
+        return post.detach()
+
+    def _update_behavior(
+        self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
+    ) -> None:
+        """Actor and critic on imagined trajectories, Eq. (2) to (4)."""
+        policy, model = self.policy, self.policy.world_model
+        with self._autocast():
+            dream = policy.dream(start, self.imagine_horizon, generator)
+            feat = dream.states.feat
+            with frozen(model):
+                reward = model.reward(feat[:, :-1])
+            value = policy.target_critic.value(feat)
+            returns = lambda_return(reward, value, self.gamma, self.lam)
+            scale = self._return_scale(returns)
+            loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
+        actor_norm = self._descend(self.actor_optimizer, loss, "actor")
+        with self._autocast():
+            logits = policy.critic(feat[:, :-1].detach())
+            value_loss = critic_loss(logits, returns, self.gamma)
+        critic_norm = self._descend(self.critic_optimizer, value_loss, "critic")
+        ema_update(policy.target_critic, policy.critic, self.target_fraction)
+        for key, tensor in {
+            "actor_loss": loss,
+            "critic_loss": value_loss,
+            "value": value.mean(),
+            "imagined_reward": reward.mean(),
+            "entropy": dream.entropy.mean(),
+            "saturated_actions": dream.saturated,
+            "return_scale": torch.as_tensor(scale),
+            "actor_grad_norm": actor_norm,
+            "critic_grad_norm": critic_norm,
+        }.items():
+            metrics[f"train/{key}"].append(tensor.detach())
+
+    def _return_scale(self, returns: Tensor) -> Tensor | float:
+        if not self.return_norm:
+            return 1.0
+        self.policy.return_scale.lerp_(return_range(returns), 0.01)
+        return self.policy.return_scale.clamp_min(1.0).clone()
+
+    def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
+
+        :return: the gradient's norm before clipping
+        """
+        optimizer.zero_grad()
+        loss.backward()
+        weights = [p for group in optimizer.param_groups for p in group["params"]]
+        norm = clip_grad_norm_(weights, self.grad_clip)
+        if not torch.isfinite(norm + loss.detach()):
+            raise FloatingPointError(
+                f"The {name} loss is {loss.item()} with gradient norm {norm.item()} at update "
+                f"{self.updates}; the weights are those of the update before: save them, and look "
+                "at the data or lower the learning rate"
+            )
+        optimizer.step()
+        return norm
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        return torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self.precision == "bf16", cache_enabled=True
+        )
+
+    # ---------------------------------------------------------------------------- randomness
+
+    def _stream(self, purpose: int, counter: int) -> np.random.Generator:
+        """Random numbers that depend on the seed, what they are for, and a counter; no state."""
+        return np.random.default_rng([self.stream_seed, purpose, counter])
+
+    def _generator(self, purpose: int, counter: int) -> Generator:
+        seed = _torch_seed(self._stream(purpose, counter))
+        return Generator(self.device).manual_seed(seed)
+
+    # ------------------------------------------------------------------------------- acting
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """The actor's action in the environment's own space, and the state to hand back.
+
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8
+        :param state: what the last call returned, None at the start
+        :param episode_start: (n,) bool, where an episode begins
+        :param deterministic: no sampling, neither of latents nor of actions
+        """
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    @property
+    def prior(self) -> PriorPolicy | None:
+        """The prior actor, with `predict`; None before it is cloned."""
+        return PriorPolicy(self.policy) if self.cloned else None
+
+    def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
+        """What the world model expects to see: (T, 64, 64, 3) uint8, `context` of them filtered."""
+        return self.policy.open_loop(trajectory, context, horizon)
+
+    # ------------------------------------------------------------------------------- logging
+
+    def _log_episodes(self, log_interval: int) -> None:
+        if log_interval is None or self.episodes % log_interval:
+            return
+        assert self.ep_info_buffer is not None and self.ep_success_buffer is not None
+        record = self.logger.record
+        if self.ep_info_buffer:
+            record("rollout/ep_rew_mean", safe_mean([e["r"] for e in self.ep_info_buffer]))
+            record("rollout/ep_len_mean", safe_mean([e["l"] for e in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        seconds = max(time.time_ns() - self.start_time, 1) / 1e9
+        record("time/episodes", self.episodes, exclude="tensorboard")
+        record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / seconds))
+        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        record("train/updates", self.updates)
+        self.logger.dump(step=self.num_timesteps)
+
+    # ------------------------------------------------------------------------ saving and loading
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "model_optimizer", "actor_optimizer", "critic_optimizer"], []
+
+    def save(
+        self,
+        path: str | os.PathLike[str] | BinaryIO,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Writes the model file: weights, optimisers, settings and counters; no replay, no data.
+
+        :param path: `.zip` is added when there is no suffix
+        :param exclude: accepted for SB3's sake; nothing optional is in the file
+        :param include: likewise
+        """
+        if isinstance(path, str | os.PathLike) and not Path(path).suffix:
+            path = Path(path).with_suffix(".zip")
+        space = self.action_space
+        about = {
+            "hyperparameters": self.hyperparameters,
+            "action_space": {"low": space.low.tolist(), "high": space.high.tolist()},
+            "dataset": str(self.dataset.path) if self.dataset is not None else None,
+            "counters": {name: getattr(self, name) for name in COUNTERS},
+        }
+        optimizers = self._get_torch_save_params()[0][1:]
+        tensors = {"policy": self.policy.state_dict()}
+        tensors |= {name: optimizer_tensors(getattr(self, name)) for name in optimizers}
+        write_model(path, about, tensors)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str] | BinaryIO,
+        env: GymEnv | str | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: Mapping[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> "WPT":
+        """Reads a model file onto any environment of at most `max_action_dim` actions.
+
+        :param path: as given to `save`
+        :param env: the environment to go on with
+        :param custom_objects: accepted for SB3's sake
+        :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
+        :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
+        """
+        if isinstance(path, str | os.PathLike) and not Path(path).exists():
+            path = Path(path).with_suffix(".zip")
+        cls._check_keywords(kwargs)
+        about, tensors = read_model(path)
+        model = cls(device=device, **{**about["hyperparameters"], **kwargs})
+        low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
+        model.action_space = spaces.Box(low, high)
+        model.policy.set_action_space(model.action_space)
+        model._take(about, tensors)
+        if env is not None:
+            model.set_env(env, force_reset)
+        return model
+
+    def _restore(self, path: Path, same: Iterable[str]) -> None:
+        about, tensors = read_model(path)
+        for name in same:
+            was, now = about["hyperparameters"][name], self.hyperparameters[name]
+            if was != now:
+                raise ValueError(
+                    f"{path} was trained with {name}={was!r}, now it is {now!r}; "
+                    "name another run_dir, or the old value"
+                )
+        self._take(about, tensors)
+
+    def _take(self, about: Mapping[str, Any], tensors: Mapping[str, dict[str, Tensor]]) -> None:
+        self.policy.load_state_dict(tensors["policy"])
+        for name in self._get_torch_save_params()[0][1:]:
+            load_optimizer(getattr(self, name), tensors[name])
+        for name in COUNTERS:
+            setattr(self, name, about["counters"][name])
+
+    def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Writes the online episodes to one file."""
+        self.replay_buffer.save(path)
+
+    def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Reads what `save_replay_buffer` wrote."""
+        self.replay_buffer = ReplayBuffer.load(path)
+
+    @classmethod
+    def _check_keywords(cls, kwargs: Mapping[str, Any]) -> None:
+        for name in kwargs:
+            if name not in KEYWORDS:
+                raise unknown_name("keyword", name, KEYWORDS)
+
+
+KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
+HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}
+COUNTERS = ("num_timesteps", "episodes", "updates", "credit", "cloned", "retrieved_ids")
+
+
+def _torch_seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
+
+
+def _last_images(infos: list[dict], dones: np.ndarray) -> dict[int, tuple[np.ndarray, bool]]:
+    """For each ended episode its last image and whether it terminated (not a time limit)."""
+    return {
+        int(i): (
+            to_images(infos[i]["terminal_observation"])[0][0],
+            not infos[i].get("TimeLimit.truncated", False),
+        )
+        for i in np.flatnonzero(dones)
+    }
+
+
+def _check_rewards(rewards: np.ndarray, step: int) -> None:
+    if not np.isfinite(rewards).all():
+        i = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise ValueError(
+            f"Environment {i} returned the reward {rewards[i]} at step {step}; nothing of this "
+            "episode was stored: mend the environment's reward"
+        )
+
+
+def _check_spaces(env: VecEnv, max_action_dim: int) -> None:
+    """Refuses what WPT cannot act in, naming what came and what would do."""
+    image, action = env.observation_space, env.action_space
+    shape = getattr(image, "shape", None) or ()
+    is_image = isinstance(image, spaces.Box) and image.dtype == np.uint8 and len(shape) == 3
+    if not is_image or 3 not in (shape[0], shape[-1]):
+        raise ValueError(
+            f"WPT sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
+            f"are {image}: render it to pixels, e.g. with gymnasium's AddRenderObservation"
+        )
+    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
+        raise ValueError(f"WPT acts in a one-dimensional Box, the environment takes {action}")
+    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
+        raise ValueError(f"The action space must have finite bounds, it is {action}")
+    if action.shape[0] > max_action_dim:
+        raise ValueError(
+            f"The environment has {action.shape[0]} actions, the model was made for at most "
+            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
+        )
+    if shape != IMAGE_SPACE.shape:
+        warnings.warn(f"Observations of {shape} are resized to {IMAGE_SPACE.shape}", stacklevel=3)
+
+
+def _check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
+    """Refuses what WPT cannot learn from, naming what came and what would do."""
+    if len(dataset) == 0:
+        raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
+    if dataset.image_size != IMAGE_SIZE:
+        raise ValueError(
+            f"The dataset {dataset.path} has images of {dataset.image_size} pixels, WPT takes "
+            f"{IMAGE_SIZE}: resize them and store them anew"
+        )
+    widest, longest = max(dataset.action_dims), max(dataset.lengths) + 1
+    if widest > max_action_dim:
+        raise ValueError(
+            f"The dataset {dataset.path} has {widest} actions, the model at most "
+            f"max_action_dim={max_action_dim}: give max_action_dim={widest}"
+        )
+    if longest < batch_length:
+        raise ValueError(
+            f"The longest trajectory of {dataset.path} has {longest} images, a batch window "
+            f"takes {batch_length}: give batch_length={longest} or less"
+        )

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 import traceback
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -23,11 +22,11 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
-from tqdm import TqdmExperimentalWarning
 from wpt_envs.tasks import Task
 
 from wpt_agents.dataset import TrajectoryDataset
@@ -36,6 +35,7 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures, report
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
 from wpt_agents.zoo.presets import Preset, wpt_keywords
+from wpt_agents.zoo.progress import LearningBar
 from wpt_agents.zoo.stages import BASELINES, Shared, console, say, write_json
 from wpt_agents.zoo.tasks import short_name
 
@@ -235,8 +235,15 @@ def make_model(
     keywords["embodiment"] = job.task.embodiment
     keywords["episode_length"] = episode_steps(job.task.id, job.shared.env)
     if start is not None:
-        return WPT.load(start, env=venv, **keywords)
-    return WPT("WPTPolicy", venv, **keywords)
+        return _Watched.load(start, env=venv, **keywords)
+    return _Watched("WPTPolicy", venv, **keywords)
+
+
+class _Watched(WPT):
+    """WPT without SB3's progress bar: the runner's stands among the callbacks."""
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback(callback)
 
 
 def _learn(job: Run, model: WPT) -> None:
@@ -246,20 +253,20 @@ def _learn(job: Run, model: WPT) -> None:
     say("learn", f"{text}, method {job.method}, seed {job.seed}")
     logger = configure(str(job.folder), ["csv", "tensorboard"])
     model.set_logger(logger)
-    with closing(logger), _evaluation(job) as callback, warnings.catch_warnings():
-        warnings.simplefilter("ignore", TqdmExperimentalWarning)  # SB3's bar is rich's
-        model.learn(steps, callback=callback, log_interval=1, progress_bar=True)
+    with closing(logger), _evaluation(job) as evaluation:
+        bar = LearningBar(job.preset.env.action_repeat)
+        model.learn(steps, callback=[bar, *evaluation], log_interval=1, progress_bar=True)
 
 
 @contextmanager
-def _evaluation(job: Run) -> Iterator[EvalCallback | None]:
-    """SB3's evaluation every so many frames, into `evaluations.npz`; None if none is wanted."""
+def _evaluation(job: Run) -> Iterator[list[BaseCallback]]:
+    """SB3's evaluation every so many frames, into `evaluations.npz`; none if none is wanted."""
     given = job.preset.evaluate
     if not given.every:
-        yield None
+        yield []
         return
     with closing(make_vec_env(job.task.id, job.shared.env, job.evaluation_seed)) as venv:
-        yield EvalCallback(
+        callback = EvalCallback(
             venv,
             n_eval_episodes=given.during_episodes,
             eval_freq=max(1, given.every // job.preset.env.action_repeat),
@@ -267,6 +274,7 @@ def _evaluation(job: Run) -> Iterator[EvalCallback | None]:
             deterministic=True,
             verbose=0,
         )
+        yield [callback]
 
 
 def _evaluate(job: Run, model: WPT) -> dict[str, Score]:

@@ -2,6 +2,8 @@
 
 import sys
 
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
 
 
@@ -13,3 +15,38 @@ def progress(
     return tqdm(
         total=total, initial=done, desc=label, unit=f" {unit}", mininterval=interval, disable=hide
     )
+
+
+class LearningBar(BaseCallback):
+    """Fine-tuning's bar. It moves once an episode, after the episode's updates have been made.
+
+    Steps are quick and updates come in bursts, so a bar that moves with every step, as SB3's does,
+    misjudges the time left.
+    """
+
+    def __init__(self, frames_a_step: int) -> None:
+        super().__init__()
+        self.frames_a_step = frames_a_step
+        self.bar: tqdm[None] | None = None
+
+    def _on_rollout_start(self) -> None:
+        if self.bar is None:  # not sooner: retrieval and cloning have bars of their own
+            total = self.locals["total_timesteps"] * self.frames_a_step
+            self.bar = progress(total, "learn", "frames")
+        self._move()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.bar is not None:
+            self._move()
+            self.bar.close()
+
+    def _move(self) -> None:
+        assert self.bar is not None
+        episodes = list(self.model.ep_info_buffer or [])[-10:]
+        if episodes:
+            returns = float(np.mean([episode["r"] for episode in episodes]))
+            self.bar.set_postfix({"return": f"{returns:.1f}"}, refresh=False)
+        self.bar.update(self.model.num_timesteps * self.frames_a_step - self.bar.n)

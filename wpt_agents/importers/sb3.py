@@ -1,0 +1,74 @@
+"""Replay buffers of Stable-Baselines3: a ring of transitions for each of several environments.
+
+Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it rescaled. With
+`optimize_memory_usage` the observation after an episode's last action is overwritten, so that
+action is left out, and no terminal state is seen.
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from wpt_agents.importers.episodes import Episodes
+from wpt_agents.trajectory import Trajectory
+
+
+class SB3Episodes(Episodes):
+    """A replay buffer's episodes, environment by environment, oldest first.
+
+    SB3 saves buffers as pickles, which run code when loaded: load one yourself, with
+    `model.load_replay_buffer(path)`, if you trust it, and give `model.replay_buffer`.
+
+    :param image_key: where the images are, if observations are dictionaries
+    """
+
+    def __init__(self, buffer: ReplayBuffer, image_key: str | None = None, **options: Any) -> None:
+        super().__init__(**options)
+        if not isinstance(buffer, ReplayBuffer):
+            raise ValueError(f"Expected a ReplayBuffer of SB3, got {type(buffer).__name__}")
+        self._buffer, self._key = buffer, image_key
+        self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
+        first = buffer.pos if buffer.full else 0
+        self._rows = (first + np.arange(buffer.size())) % buffer.buffer_size
+        if self._overwritten and buffer.full:
+            self._rows = self._rows[1:]  # the oldest holds the newest's next observation
+        self._bounds = [b for env in range(buffer.n_envs) for b in self._find_bounds(env)]
+        if not self._bounds:
+            raise ValueError("The replay buffer holds no episode")
+
+    def _find_bounds(self, env: int) -> list[tuple[int, int, int]]:
+        """Environment, first row in order of age, and one past the last, for each episode."""
+        ends = np.flatnonzero(self._buffer.dones[self._rows, env]) + 1
+        edges = np.unique(np.concatenate([[0], ends, [len(self._rows)]])).tolist()
+        shortest = 2 if self._overwritten else 1
+        return [(env, start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+
+    def __len__(self) -> int:
+        return len(self._bounds)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        env, start, stop = self._bounds[i]
+        rows, buffer = self._rows[start:stop], self._buffer
+        image = self._images(buffer.observations)[rows, env]
+        terminated = False
+        if self._overwritten:
+            rows = rows[:-1]
+        else:
+            last = self._images(buffer.next_observations)[rows[-1:], env]
+            image = np.concatenate([image, last])
+            over = buffer.dones[rows[-1], env] and not buffer.timeouts[rows[-1], env]
+            terminated = bool(over)
+        source = f"SB3 replay buffer, environment {env}, steps {start} to {stop - 1}"
+        action, reward = buffer.actions[rows, env], buffer.rewards[rows, env]
+        return self._trajectory(image, action, reward, source, terminated=terminated)
+
+    def _images(self, observations: Any) -> np.ndarray:
+        if not isinstance(observations, dict):
+            return observations
+        if self._key not in observations:
+            raise ValueError(
+                f"The replay buffer's observations are {', '.join(observations)}; give image_key"
+            )
+        return observations[self._key]

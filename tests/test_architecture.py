@@ -14,7 +14,7 @@ LAYERS = [
     {"trajectory", "distributions", "networks", "guidance", "archive", "names"},
     {"windows", "shards", "model_file"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
-    {"retrieval", "importers", "world_model"},
+    {"retrieval", "importers", "world_model", "checks"},
     {"policy"},
     {"rollout"},
     {"wpt"},

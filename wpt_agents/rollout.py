@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wpt_agents.policy import State, WPTPolicy, prior_action, stack_frames
+from wpt_agents.policy import State, WPTPolicy, prior_action, stack_frames, to_images
 from wpt_agents.trajectory import Trajectory
 
 Window = tuple[int, int]
@@ -102,3 +102,14 @@ def random_guide(policy: WPTPolicy, rng: np.random.Generator) -> Callable[[np.nd
         return (rng.uniform(-1, 1, (len(frames), len(mask))) * mask).astype(np.float32)
 
     return guide
+
+
+def last_images(infos: list[dict], dones: np.ndarray) -> dict[int, tuple[np.ndarray, bool]]:
+    """For each ended episode its last image and whether it terminated (not a time limit)."""
+    return {
+        int(i): (
+            to_images(infos[i]["terminal_observation"])[0][0],
+            not infos[i].get("TimeLimit.truncated", False),
+        )
+        for i in np.flatnonzero(dones)
+    }

@@ -13,7 +13,6 @@ import inspect
 import os
 import tempfile
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
@@ -42,6 +41,7 @@ from wpt_agents.actor_critic import (
     return_range,
 )
 from wpt_agents.behavior_cloning import FRAMES, bc_loss, random_shift
+from wpt_agents.checks import check_dataset, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.model_file import load_optimizer, optimizer_tensors, read_model, write_model
@@ -50,9 +50,9 @@ from wpt_agents.networks import SIZES, frozen
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, State, WPTPolicy, to_images
 from wpt_agents.replay import ReplayBuffer, mix
 from wpt_agents.retrieval import Retriever
-from wpt_agents.rollout import Rollout, clone_guide, random_guide
+from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide
 from wpt_agents.rssm import Latent
-from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
+from wpt_agents.trajectory import Trajectory
 from wpt_agents.world_model import reward_loss, world_model_update_loss
 
 Data = str | os.PathLike[str] | TrajectoryDataset | Iterable[Trajectory]
@@ -241,7 +241,7 @@ class WPT(BaseAlgorithm):
                 for trajectory in dataset:
                     store.append(trajectory)
             dataset = TrajectoryDataset.open(store.path)
-        _check_dataset(dataset, self.max_action_dim, self.batch_length)
+        check_dataset(dataset, self.max_action_dim, self.batch_length)
         self.dataset = dataset
 
     @staticmethod
@@ -262,7 +262,7 @@ class WPT(BaseAlgorithm):
             are wider than `max_action_dim`
         """
         wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
-        _check_spaces(wrapped, self.max_action_dim)
+        check_spaces(wrapped, self.max_action_dim)
         if self.episodes and wrapped.action_space.shape != self.action_space.shape:
             self.reset_task()
         self.env, self.n_envs = wrapped, wrapped.num_envs
@@ -466,7 +466,7 @@ class WPT(BaseAlgorithm):
             image, _ = to_images(self._last_obs)
             action = rollout.act(image, self._guide())
             new_obs, rewards, dones, infos = self.env.step(self.policy.to_env(action))
-            _check_rewards(rewards, self.num_timesteps)
+            check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.learning_starts:
                 self.credit += self.n_envs
@@ -474,7 +474,7 @@ class WPT(BaseAlgorithm):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            for trajectory in rollout.end_step(rewards, dones, _last_images(infos, dones)):
+            for trajectory in rollout.end_step(rewards, dones, last_images(infos, dones)):
                 self.replay_buffer.add(trajectory)
                 self.episode_length = len(trajectory)
                 self.episodes += 1
@@ -796,68 +796,3 @@ COUNTERS = ("num_timesteps", "episodes", "updates", "credit", "cloned", "retriev
 
 def _torch_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31))
-
-
-def _last_images(infos: list[dict], dones: np.ndarray) -> dict[int, tuple[np.ndarray, bool]]:
-    """For each ended episode its last image and whether it terminated (not a time limit)."""
-    return {
-        int(i): (
-            to_images(infos[i]["terminal_observation"])[0][0],
-            not infos[i].get("TimeLimit.truncated", False),
-        )
-        for i in np.flatnonzero(dones)
-    }
-
-
-def _check_rewards(rewards: np.ndarray, step: int) -> None:
-    if not np.isfinite(rewards).all():
-        i = int(np.flatnonzero(~np.isfinite(rewards))[0])
-        raise ValueError(
-            f"Environment {i} returned the reward {rewards[i]} at step {step}; nothing of this "
-            "episode was stored: mend the environment's reward"
-        )
-
-
-def _check_spaces(env: VecEnv, max_action_dim: int) -> None:
-    """Refuses what WPT cannot act in, naming what came and what would do."""
-    image, action = env.observation_space, env.action_space
-    shape = getattr(image, "shape", None) or ()
-    is_image = isinstance(image, spaces.Box) and image.dtype == np.uint8 and len(shape) == 3
-    if not is_image or 3 not in (shape[0], shape[-1]):
-        raise ValueError(
-            f"WPT sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
-            f"are {image}: render it to pixels, e.g. with gymnasium's AddRenderObservation"
-        )
-    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
-        raise ValueError(f"WPT acts in a one-dimensional Box, the environment takes {action}")
-    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
-        raise ValueError(f"The action space must have finite bounds, it is {action}")
-    if action.shape[0] > max_action_dim:
-        raise ValueError(
-            f"The environment has {action.shape[0]} actions, the model was made for at most "
-            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
-        )
-    if shape != IMAGE_SPACE.shape:
-        warnings.warn(f"Observations of {shape} are resized to {IMAGE_SPACE.shape}", stacklevel=3)
-
-
-def _check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
-    """Refuses what WPT cannot learn from, naming what came and what would do."""
-    if len(dataset) == 0:
-        raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
-    if dataset.image_size != IMAGE_SIZE:
-        raise ValueError(
-            f"The dataset {dataset.path} has images of {dataset.image_size} pixels, WPT takes "
-            f"{IMAGE_SIZE}: resize them and store them anew"
-        )
-    widest, longest = max(dataset.action_dims), max(dataset.lengths) + 1
-    if widest > max_action_dim:
-        raise ValueError(
-            f"The dataset {dataset.path} has {widest} actions, the model at most "
-            f"max_action_dim={max_action_dim}: give max_action_dim={widest}"
-        )
-    if longest < batch_length:
-        raise ValueError(
-            f"The longest trajectory of {dataset.path} has {longest} images, a batch window "
-            f"takes {batch_length}: give batch_length={longest} or less"
-        )

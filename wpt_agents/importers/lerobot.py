@@ -130,7 +130,9 @@ class LeRobotEpisodes(Episodes):
             chunk_index=row[prefix + "chunk_index"],
             file_index=row[prefix + "file_index"],
         )
-        times = row[prefix + "from_timestamp"] + np.ravel(table["timestamp"].to_numpy())
+        times = row[prefix + "from_timestamp"] + np.ravel(table["timestamp"].to_numpy()).astype(
+            np.float64
+        )
         found: list[np.ndarray] = []
         slack = 0.5 / self._info["fps"]
         for time, frame in _frames(path, float(times[0]), slack):

@@ -16,8 +16,9 @@ from wpt_envs.tasks import TASKS, Task
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import benchmark, report, stages
-from wpt_agents.zoo.benchmark import METHODS, Run, run
+from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate, mean_interval
+from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.presets import Preset
 
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)

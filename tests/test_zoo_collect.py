@@ -149,3 +149,12 @@ def test_what_cannot_be_collected_is_refused_before_anything_is_written(tmp_path
     with pytest.raises(ValueError, match=message):
         collect(tmp_path / "data", **({"tasks": [DOT], "episodes": 1} | given))
     assert not (tmp_path / "data").exists()
+
+
+def test_scripts_are_noised_from_episode_to_episode(tmp_path):
+    task, env = "wpt/metaworld-reach-v0", {"rendering": "fast"}
+    data = collect(tmp_path, [task], 2, 0, 1, "scripted", env, progress_bar=False)
+    assert [t.source for t in data] == [f"scripted policy, sigma {s}" for s in (0.1, 0.3)]
+    assert [len(t) for t in data] == [100, 100]
+    roughness = [np.abs(np.diff(t.action[:, 3])).mean() for t in data]  # the gripper's
+    assert roughness[0] < roughness[1]

@@ -15,7 +15,7 @@ ALL = [(suite, name) for suite in suite_names() for name in preset_names(suite)]
 def test_every_preset_holds_valid_keywords_and_tasks_that_exist(suite, name):
     preset = load_preset(suite, name)
     rows = find_tasks(suite, preset.collect.tasks)
-    assert len({row.embodiment for row in rows}) >= 2  # cross-embodiment data
+    assert suite != "dmc" or len({row.embodiment for row in rows}) >= 2  # several robots
     assert preset.wpt["max_action_dim"] >= max(row.action_dim for row in rows)
 
 

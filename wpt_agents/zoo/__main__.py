@@ -71,7 +71,7 @@ def list_tasks(
     from wpt_envs.tasks import TASKS
 
     from wpt_agents.names import unknown_name
-    from wpt_agents.zoo.benchmark import METHODS
+    from wpt_agents.zoo.plan import METHODS
     from wpt_agents.zoo.presets import preset_names, suite_names
     from wpt_agents.zoo.stages import console
 

@@ -14,7 +14,6 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,105 +26,18 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
-from wpt_envs.tasks import Task
 
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.names import unknown_name
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures, report
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
-from wpt_agents.zoo.presets import Preset, wpt_keywords
+from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.progress import LearningBar
-from wpt_agents.zoo.stages import BASELINES, Shared, console, say, write_json
+from wpt_agents.zoo.stages import BASELINES, console, say, write_json
 from wpt_agents.zoo.tasks import short_name
 
-EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
 PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
 SIMULATORS = ("dm-control", "metaworld")
-
-
-@dataclass(frozen=True)
-class Method:
-    """Which of the paper's parts are on.
-
-    :param wpt: keywords of WPT that switch the others off
-    """
-
-    pretrained: bool = True
-    needs_data: bool = True
-    wpt: Mapping[str, Any] = field(default_factory=dict)
-
-
-METHODS = {
-    "wpt": Method(),
-    "scratch": Method(False, False, {"offline_ratio": 0.0, "guidance": 0.0}),
-    "no-guidance": Method(wpt={"guidance": 0.0}),
-    "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
-    "no-pretrain": Method(pretrained=False),
-}
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run, fully told before it begins."""
-
-    task: Task
-    seed: int
-    method: str
-    preset_name: str
-    preset: Preset
-    out: Path
-    workers: int = 2
-    device: str = "auto"
-
-    def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise unknown_name("method", self.method, METHODS)
-
-    @property
-    def folder(self) -> Path:
-        """out/preset/method/task_seed, the layout that RL Zoo's plots read."""
-        name = f"{short_name(self.task)}_{self.seed}"
-        return self.out / self.preset_name / self.method / name
-
-    @property
-    def shared(self) -> Shared:
-        """The stages that this run shares with others."""
-        return Shared(self.preset, self.task.suite, self.out / "cache", self.workers, self.device)
-
-    @property
-    def wpt(self) -> dict[str, Any]:
-        """The keywords of WPT, the method's switches included."""
-        return {**self.preset.wpt, **METHODS[self.method].wpt}
-
-    @property
-    def updates(self) -> int:
-        """The fine-tuning updates that the run will make, within an episode's worth."""
-        wpt = wpt_keywords() | self.wpt
-        steps = max(self.preset.steps - wpt["learning_starts"], 0)
-        return int(steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"]))
-
-    @property
-    def evaluation_seed(self) -> int:
-        """Where evaluation's episodes start; below 2**31, as some simulators want."""
-        state = np.random.SeedSequence([self.seed, EVALUATION]).generate_state(1)
-        return int(state[0] >> 1)
-
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration, as `config.yaml` holds it."""
-        about = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
-        return {
-            **about,
-            "seed": self.seed,
-            "preset": self.preset_name,
-            **self.preset.as_dict(),
-            "wpt": self.wpt,
-        }
-
-    def result(self) -> dict[str, Any] | None:
-        """What `result.json` holds, None while the run is not finished."""
-        path = self.folder / "result.json"
-        return json.loads(path.read_text()) if path.exists() else None
 
 
 def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
@@ -138,11 +50,11 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
     for number, job in enumerate(jobs, 1):
         say(f"run {number}/{len(jobs)}", f"{short_name(job.task)}, {job.method}, seed {job.seed}")
         try:
-            result = run(job, force)
+            done = run(job, force)
         except Exception as error:  # whatever one run dies of, the others are not to blame
             console.print(f"[red]failed[/red]: {error}\nTraceback: {job.folder / 'error.txt'}")
             continue
-        console.print(report.scores_table(result))
+        console.print(report.scores_table(done))
         console.print(f"Run folder: [bold]{job.folder.resolve()}[/bold]")
     results = [result for job in jobs if (result := job.result())]
     if len(results) > 1:

@@ -7,12 +7,13 @@ Example::
 
 import json
 import os
+import warnings
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,7 @@ def scripted_actions(rng: np.random.Generator, task: str, sigma: float) -> tuple
     """Meta-World's own scripted policy with Gaussian noise, and its name."""
     from metaworld.policies import ENV_POLICY_MAP  # loads a simulator
 
-    policy = ENV_POLICY_MAP[f"{wpt_envs.TASKS[task].name}-v3"]()
+    policy = ENV_POLICY_MAP[f"{wpt_envs.TASKS[task].name}-v3"]()  # type: ignore[abstract]
 
     def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
         action = policy.get_action(np.asarray(info["state"], np.float64))
@@ -79,14 +80,14 @@ def scripted_actions(rng: np.random.Generator, task: str, sigma: float) -> tuple
 def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
     """Plays one episode, cut after `max_steps`, and returns it with its rewards."""
     obs, info = env.reset(seed=seed)
-    images, actions, rewards = [obs], [], []
+    images, actions, rewards = [obs], list[np.ndarray](), list[float]()
     terminated = truncated = False
     while not (terminated or truncated or len(actions) == max_steps):
         action = np.asarray(act(obs, info, len(actions)), np.float32)
         obs, reward, terminated, truncated, info = env.step(action)
         images.append(obs)
         actions.append(action)
-        rewards.append(reward)
+        rewards.append(float(reward))
     return Trajectory(
         np.stack(images), np.stack(actions), np.array(rewards, np.float32), bool(terminated)
     )
@@ -110,7 +111,8 @@ def play(job: Job) -> list[Trajectory]:
     env = gym.make(job.task, **job.env, **({"state_in_info": True} if scripted else {}))
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    with closing(env):
+    with closing(env), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
         episodes = range(job.first, job.first + job.count)
         return [_play_episode(env, job, episode) for episode in episodes]
 
@@ -122,18 +124,12 @@ def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
     if job.behaviour == "scripted":
         act, name = scripted_actions(rng, job.task, SIGMAS[episode % len(SIGMAS)])
     else:
+        assert env.action_space.shape is not None
         act, name = noise_actions(rng, env.action_space.shape[0], MAX_STEPS)
     played = record(env, act, int(source.generate_state(1)[0]))
     row = wpt_envs.TASKS.get(job.task)
-    return Trajectory(
-        played.image,
-        played.action,
-        None,  # reward-free
-        played.terminated,
-        embodiment=row.embodiment if row else None,
-        task=job.task,
-        source=name,
-    )
+    robot = row.embodiment if row else None
+    return replace(played, reward=None, embodiment=robot, task=job.task, source=name)
 
 
 def collect(
@@ -157,11 +153,11 @@ def collect(
     :param env: keyword arguments of `gymnasium.make`
     """
     _check(tasks, episodes, behaviour)
+    env = dict(env or {})
     told = {"tasks": list(tasks), "episodes": episodes, "seed": seed, "behaviour": behaviour}
-    told["env"] = dict(env or {})
-    dataset = _open(Path(path), told)
+    dataset = _open(Path(path), {**told, "env": env})
     jobs = [
-        Job(task, first, min(EPISODES_A_JOB, episodes - first), seed, behaviour, told["env"])
+        Job(task, first, min(EPISODES_A_JOB, episodes - first), seed, behaviour, env)
         for at, task in enumerate(tasks)
         for first in range(_done(dataset, at, episodes), episodes, EPISODES_A_JOB)
     ]
@@ -197,7 +193,8 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str) -> None:
 def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     """The dataset to append to: a new one, or the one that the same call began."""
     label = path / "collect.json"
-    dataset = TrajectoryDataset.open(path) if path.exists() else TrajectoryDataset.create(path)
+    begun = path.exists() and any(path.iterdir())
+    dataset = TrajectoryDataset.open(path) if begun else TrajectoryDataset.create(path)
     if not label.exists() and len(dataset) == 0:
         label.write_text(json.dumps(told, indent=1))
     found = json.loads(label.read_text()) if label.exists() else {}

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +11,7 @@ import wpt_envs
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from wpt_agents.trajectory import Trajectory
@@ -25,17 +26,8 @@ T_975 = (
 )
 
 
-class Policy(Protocol):
-    """Anything with SB3's `predict`."""
-
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Actions (n, A) for observations (n, 64, 64, 3), and the next recurrent state."""
+Observation = np.ndarray | dict[str, np.ndarray]
+State = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -46,11 +38,11 @@ class DoNothing:
 
     def predict(
         self,
-        observation: np.ndarray,
-        state: Any = None,
+        observation: Observation,
+        state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, None]:
+    ) -> tuple[np.ndarray, State | None]:
         """Zeros, (n, A)."""
         return np.zeros((len(observation), *self.action_space.shape), np.float32), None
 
@@ -63,11 +55,11 @@ class RandomPolicy:
 
     def predict(
         self,
-        observation: np.ndarray,
-        state: Any = None,
+        observation: Observation,
+        state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, None]:
+    ) -> tuple[np.ndarray, State | None]:
         """Uniform draws, (n, A), whatever `deterministic` says."""
         low, high = self.action_space.low, self.action_space.high
         return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
@@ -127,7 +119,12 @@ def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
 
 
 def evaluate(
-    policy: Policy, task: str, env: Mapping[str, Any], episodes: int, seed: int, label: str = ""
+    policy: PolicyPredictor,
+    task: str,
+    env: Mapping[str, Any],
+    episodes: int,
+    seed: int,
+    label: str = "",
 ) -> Score:
     """Returns over `episodes` episodes, each with its own seed, all played side by side.
 
@@ -146,12 +143,12 @@ def evaluate(
         returns, _ = evaluate_policy(
             policy, venv, episodes, callback=watch, return_episode_rewards=True
         )
-    return Score([float(value) for value in returns], successes)
+    return Score(np.asarray(returns, float).tolist(), successes)
 
 
-def acting(policy: Policy) -> Act:
+def acting(policy: PolicyPredictor) -> Act:
     """A policy as `record` plays it: remembers the recurrent state within an episode."""
-    state: Any = None
+    state: State | None = None
 
     def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
         nonlocal state
@@ -163,7 +160,7 @@ def acting(policy: Policy) -> Act:
 
 
 def film(
-    policy: Policy, task: str, env: Mapping[str, Any], seed: int, size: int = 256
+    policy: PolicyPredictor, task: str, env: Mapping[str, Any], seed: int, size: int = 256
 ) -> tuple[Trajectory, list[np.ndarray], float]:
     """One episode, its pictures at `size`, and the frames a second that make it real time."""
     frames: list[np.ndarray] = []

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import matplotlib
@@ -10,6 +11,7 @@ import numpy as np
 
 matplotlib.use("Agg")  # no display
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 
 from wpt_agents.zoo.evaluation import Score
 
@@ -36,20 +38,17 @@ def learning_curve(
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     axes.plot(frames, returns, ".", color=COLOURS["WPT"], alpha=0.3, label="training episodes")
     if len(returns) >= window:
-        mean = np.convolve(returns, np.ones(window) / window, "valid")
+        smooth = np.convolve(returns, np.ones(window) / window, "valid")
         label = f"their mean over {window}"
-        axes.plot(frames[window - 1 :], mean, color=COLOURS["WPT"], lw=2, label=label)
+        axes.plot(frames[window - 1 :], smooth, color=COLOURS["WPT"], lw=2, label=label)
     if evaluations is not None:
         at, each = evaluations
         axes.plot(at, each.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
     for name, score in scores.items():
-        mean, low, high = score.interval
         if name == "WPT":
-            bar = [[mean - low], [high - mean]] if low is not None and high is not None else None
-            style = {"color": COLOURS["WPT"], "mec": "white", "ms": 9, "capsize": 4, "zorder": 3}
-            end = max(frames, default=0)
-            axes.errorbar([end], [mean], bar, fmt="D", label=f"WPT at the end, {mean:.0f}", **style)
+            _final_point(axes, max(frames, default=0), score)
         else:
+            mean = score.interval[0]
             axes.axhline(mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
             text = f"{name} {mean:.0f}"
             axes.annotate(text, (0.01, mean), xycoords=("axes fraction", "data"), va="bottom")
@@ -59,6 +58,15 @@ def learning_curve(
     axes.legend(frameon=False, loc="best")
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def _final_point(axes: Axes, at: float, score: Score) -> None:
+    """The evaluation at the end, with its 95 % interval."""
+    mean, low, high = score.interval
+    bar = [[mean - low], [high - mean]] if low is not None and high is not None else None
+    style: dict[str, Any] = {"fmt": "D", "color": COLOURS["WPT"], "mec": "white", "ms": 9}
+    label = f"WPT at the end, {mean:.0f}"
+    axes.errorbar([at], [mean], bar, label=label, capsize=4, zorder=3, **style)
 
 
 def prediction_strip(

@@ -1,14 +1,105 @@
 """From the words of a command to the runs that it asks for, all checked before any begins."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.table import Table
+from wpt_envs.tasks import Task
 
-from wpt_agents.zoo.benchmark import METHODS, Run
-from wpt_agents.zoo.presets import load_preset
-from wpt_agents.zoo.stages import console
+from wpt_agents.names import unknown_name
+from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
+from wpt_agents.zoo.stages import Shared, console
 from wpt_agents.zoo.tasks import find_tasks, short_name
+
+EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
+
+
+@dataclass(frozen=True)
+class Method:
+    """Which of the paper's parts are on.
+
+    :param wpt: keywords of WPT that switch the others off
+    """
+
+    pretrained: bool = True
+    needs_data: bool = True
+    wpt: Mapping[str, Any] = field(default_factory=dict)
+
+
+METHODS = {
+    "wpt": Method(),
+    "scratch": Method(False, False, {"offline_ratio": 0.0, "guidance": 0.0}),
+    "no-guidance": Method(wpt={"guidance": 0.0}),
+    "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
+    "no-pretrain": Method(pretrained=False),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run, fully told before it begins."""
+
+    task: Task
+    seed: int
+    method: str
+    preset_name: str
+    preset: Preset
+    out: Path
+    workers: int = 2
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise unknown_name("method", self.method, METHODS)
+
+    @property
+    def folder(self) -> Path:
+        """out/preset/method/task_seed, the layout that RL Zoo's plots read."""
+        name = f"{short_name(self.task)}_{self.seed}"
+        return self.out / self.preset_name / self.method / name
+
+    @property
+    def shared(self) -> Shared:
+        """The stages that this run shares with others."""
+        return Shared(self.preset, self.task.suite, self.out / "cache", self.workers, self.device)
+
+    @property
+    def wpt(self) -> dict[str, Any]:
+        """The keywords of WPT, the method's switches included."""
+        return {**self.preset.wpt, **METHODS[self.method].wpt}
+
+    @property
+    def updates(self) -> int:
+        """The fine-tuning updates that the run will make, within an episode's worth."""
+        wpt = wpt_keywords() | self.wpt
+        steps = max(self.preset.steps - wpt["learning_starts"], 0)
+        return int(steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"]))
+
+    @property
+    def evaluation_seed(self) -> int:
+        """Where evaluation's episodes start; below 2**31, as some simulators want."""
+        state = np.random.SeedSequence([self.seed, EVALUATION]).generate_state(1)
+        return int(state[0] >> 1)
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, as `config.yaml` holds it."""
+        about = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
+        return {
+            **about,
+            "seed": self.seed,
+            "preset": self.preset_name,
+            **self.preset.as_dict(),
+            "wpt": self.wpt,
+        }
+
+    def result(self) -> dict[str, Any] | None:
+        """What `result.json` holds, None while the run is not finished."""
+        path = self.folder / "result.json"
+        return json.loads(path.read_text()) if path.exists() else None
 
 
 def parse_seeds(text: str) -> list[int]:

@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
@@ -111,7 +111,7 @@ class Preset:
     @classmethod
     def of(cls, given: Mapping[str, Mapping[str, Any]]) -> Self:
         """Builds a preset from the sections of a YAML file."""
-        types = {f.name: f.type for f in fields(cls)}
+        types = get_type_hints(cls)
         for title, section in given.items():
             if title not in types:
                 raise unknown_name("section", title, types)

@@ -84,17 +84,21 @@ def scores_table(result: Mapping[str, Any]) -> Table:
     """The policies of one run side by side."""
     about = f"{result['task']}, {result['method']}, seed {result['seed']}"
     episodes = len(result["scores"]["WPT"]["returns"])
-    caption = f"return over {episodes} episodes, {result['frames']:,} frames of fine-tuning"
+    caption = f"{episodes} episodes each, after {result['frames']:,} frames of fine-tuning"
     table = Table(title=about, caption=caption)
     table.add_column("policy")
     for heading in ("mean return", "95 % interval", "lowest", "highest"):
         table.add_column(heading, justify="right")
+    successes = result["metric"] == "success"
+    if successes:
+        table.add_column("success", justify="right")
     names = {"nothing": "doing nothing", "random": "random policy"}
     for name, score in result["scores"].items():
         cells = number(score["mean"]), interval_text(score["low"], score["high"])
         extremes = number(min(score["returns"])), number(max(score["returns"]))
         style = "bold" if name == "WPT" else None
-        table.add_row(names.get(name, name), *cells, *extremes, style=style)
+        rate = [number(score["success_rate"])] if successes else []
+        table.add_row(names.get(name, name), *cells, *extremes, *rate, style=style)
     return table
 
 

@@ -18,15 +18,16 @@ import numpy as np
 from gymnasium import spaces
 from rich.console import Console
 from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import Task
 
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.collect import collect
-from wpt_agents.zoo.evaluation import DoNothing, Policy, RandomPolicy, Score, evaluate
+from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, Score, evaluate
 from wpt_agents.zoo.presets import Preset
-from wpt_agents.zoo.tasks import find_task
+from wpt_agents.zoo.tasks import find_tasks
 
 console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
 
@@ -78,7 +79,7 @@ class Shared:
     @property
     def tasks(self) -> list[str]:
         """The ids of the tasks that data are collected on."""
-        return [find_task(self.suite, name).id for name in self.preset.collect.tasks]
+        return [row.id for row in find_tasks(self.suite, self.preset.collect.tasks)]
 
     @property
     def data_path(self) -> Path:
@@ -104,7 +105,7 @@ class Shared:
         except ValueError:
             found = 0  # `collect` says what is wrong
         state = "reused" if found == wanted else f"continued at {found} of" if found else "making"
-        names = ", ".join(self.preset.collect.tasks)
+        names = ", ".join(given.tasks) or f"all tasks of {self.suite}"
         say("collect", f"{state} {wanted} reward-free episodes of {names}  [dim]{self.data_path}")
         return collect(
             self.data_path,
@@ -159,7 +160,7 @@ class Shared:
         return score
 
 
-BASELINES: Mapping[str, Callable[[spaces.Box, int], Policy]] = {
+BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
     "nothing": lambda space, seed: DoNothing(space),
     "random": RandomPolicy,
 }

@@ -29,11 +29,6 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
     return list(found.values())
 
 
-def find_task(suite: str, name: str) -> Task:
-    """The one task of this name."""
-    return find_tasks(suite, [name])[0]
-
-
 def short_name(task: Task) -> str:
     """'dmc-walker-run', as folders and tables call it."""
     return f"{task.suite}-{task.name}"

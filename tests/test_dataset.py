@@ -339,7 +339,8 @@ def test_reading_changes_nothing_in_the_folder_so_it_may_be_read_only(tmp_path):
 
 
 def test_a_fork_that_inherits_the_threads_can_sample(tmp_path):
-    dataset = made(tmp_path, chain(20))
+    made(tmp_path, chain(20))
+    dataset = TrajectoryDataset.open(tmp_path, workers=2)
     dataset.sample(4, 9, 2, rng())
     dataset._pool_owner = -1  # what a child sees: the threads belong to another process
     check_chain(dataset.sample(4, 9, 2, rng()))

@@ -55,7 +55,7 @@ class TrajectoryDataset:
     is held in memory.
 
     :param ids: where each trajectory stands in the folder, for a subset
-    :param workers: threads that decompress
+    :param workers: threads that decompress; they pay only where cores are to spare
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class TrajectoryDataset:
         meta: Meta,
         entries: list[Entry],
         ids: Sequence[int] | None = None,
-        workers: int = 2,
+        workers: int = 0,
     ) -> None:
         self.path, self.workers = path, workers
         self._meta, self._entries, self._ids = meta, entries, ids
@@ -79,7 +79,7 @@ class TrajectoryDataset:
         path: str | os.PathLike[str],
         image_size: int = IMAGE_SIZE,
         codec: str = "zstd",
-        workers: int = 2,
+        workers: int = 0,
     ) -> "TrajectoryDataset":
         """Makes an empty dataset in a new or empty folder.
 
@@ -89,7 +89,7 @@ class TrajectoryDataset:
         return cls.open(path, workers)
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], workers: int = 2) -> "TrajectoryDataset":
+    def open(cls, path: str | os.PathLike[str], workers: int = 0) -> "TrajectoryDataset":
         """Opens a dataset, reading its index only.
 
         :raises ValueError: no dataset there, one of a newer version, or a damaged index

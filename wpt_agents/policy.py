@@ -50,7 +50,7 @@ def to_images(observation: np.ndarray) -> tuple[np.ndarray, bool]:
         pixels = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float()
         pixels = F.interpolate(pixels, (IMAGE_SIZE, IMAGE_SIZE), mode="bilinear", antialias=True)
         images = pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()
-    return np.ascontiguousarray(images), batched
+    return np.require(images, requirements=("C", "W")), batched
 
 
 class WPTPolicy(BasePolicy):
@@ -82,7 +82,7 @@ class WPTPolicy(BasePolicy):
         self.reset_behavior()
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.ones(()))
-        self.generator: Generator | None = None
+        self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
@@ -113,6 +113,7 @@ class WPTPolicy(BasePolicy):
         state: State | None,
         episode_start: np.ndarray | None,
         deterministic: bool = False,
+        generator: Generator | None = None,
     ) -> tuple[np.ndarray, State]:
         """One step of filtering and acting.
 
@@ -120,6 +121,7 @@ class WPTPolicy(BasePolicy):
         :param state: from the step before, or None
         :param episode_start: (n,) bool, where the state is reset
         :param deterministic: take the likeliest latent and the mean action
+        :param generator: of the draws; torch's own if None
         :return: action (n, A) in [-1, 1], zero in the padding, and the new state
         """
         n = len(image)
@@ -131,11 +133,11 @@ class WPTPolicy(BasePolicy):
             action[:, None],
             self._tensor(first)[:, None],
             Latent(deter, stoch),
-            self.generator,
+            generator,
             sample=not deterministic,
         )
         dist = self.actor.dist(post.feat[:, 0], self.action_mask)
-        action = dist.mode if deterministic else dist.rsample(self.generator)
+        action = dist.mode if deterministic else dist.rsample(generator)
         if not torch.isfinite(action).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
         return action.cpu().numpy(), tuple(
@@ -149,7 +151,8 @@ class WPTPolicy(BasePolicy):
         """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
         low, high = self.action_space.low, self.action_space.high
         own = action[:, : len(low)].clip(-1, 1)
-        return (low + 0.5 * (own + 1) * (high - low)).astype(self.action_space.dtype)
+        action = low + 0.5 * (own + 1) * (high - low)
+        return action.clip(low, high).astype(self.action_space.dtype)  # rounding may overstep
 
     def predict(
         self,
@@ -202,7 +205,7 @@ class WPTPolicy(BasePolicy):
         """
         stop = min(context + horizon, len(trajectory) + 1)
         batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)])
-        frames = self.world_model.open_loop(batch.to(self.device), context, self.generator)
+        frames = self.world_model.open_loop(batch.to(self.device), context)
         return frames[0].cpu().numpy()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

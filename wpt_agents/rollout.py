@@ -46,7 +46,9 @@ class Rollout:
         for i in np.flatnonzero(self.first):
             self.windows[i] = self.draw()
         self.frames = stack_frames(image, self.frames, self.first)
-        action, state = self.policy.act(image, self.state, self.first)
+        action, state = self.policy.act(
+            image, self.state, self.first, generator=self.policy.generator
+        )
         time = np.array([len(actions) for actions in self.actions])
         start, stop = np.array(self.windows).T
         guided = (start <= time) & (time < stop)

@@ -56,9 +56,9 @@ def dot(monkeypatch):
     del gym.registry[DOT.id]
 
 
-def job(tmp_path, method="wpt", seed=0, **changes):
+def job(tmp_path, method="wpt", seed=0, data=None, **changes):
     sections = {title: SECTIONS[title] | changes.get(title, {}) for title in SECTIONS}
-    return Run(DOT, seed, method, "toy", Preset.of(sections), tmp_path, workers=1)
+    return Run(DOT, seed, method, "toy", Preset.of(sections), tmp_path, 1, data=data)
 
 
 def test_a_run_leaves_everything_in_one_folder(tmp_path):
@@ -120,6 +120,15 @@ def test_a_change_of_fine_tuning_keeps_the_pretrained_model_and_others_do_not(tm
     assert job(tmp_path, pretrain={"steps": 3}).shared.model_path != before.model_path
     assert job(tmp_path, collect={"episodes": 5}).shared.model_path != before.model_path
     assert job(tmp_path, env={"rendering": "near"}).shared.data_path != before.data_path
+
+
+def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
+    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    one = job(tmp_path, data=own)
+    assert one.shared.model_path != job(tmp_path).shared.model_path
+    run(one)
+    assert one.config()["data"] == str(own)
+    assert not list((tmp_path / "cache").glob("data-*"))
 
 
 def test_half_a_pretraining_is_continued(tmp_path, monkeypatch):
@@ -251,6 +260,7 @@ def call(monkeypatch, *words):
         (["run", "--method", "scrath"], "Did you mean 'scratch'"),
         (["run", "--seeds", "none"], "how many"),
         (["run", "--tasks", "walker-run", "walker-rum"], "Did you mean 'walker-run'"),
+        (["run", "--data", "nowhere"], "nowhere does not exist"),
         (["report", "nowhere"], "No finished run below nowhere"),
         (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
         (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),

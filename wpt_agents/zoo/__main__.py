@@ -59,6 +59,9 @@ Settings = Annotated[
 ]
 Out = Annotated[Path, typer.Option(help="Where the run folders and the shared stages go.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that collect data.")]
+Data = Annotated[
+    Path | None, typer.Option(help="A dataset of your own. None: the preset's, collected.")
+]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
 
 
@@ -118,23 +121,22 @@ def collect_data(
 def pretrain_model(
     suite: Suite = "dmc",
     preset: PresetName = "demo",
-    data: Annotated[Path | None, typer.Option(help="A dataset; none: the preset's.")] = None,
+    data: Data = None,
     settings: Settings = [],  # noqa: B006
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
 ) -> None:
-    """Collects a preset's data and pre-trains its world model; `run` reuses both.
+    """Pre-trains a preset's world model, on its data or yours; `run` reuses it.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
     """
-    from wpt_agents.dataset import TrajectoryDataset
     from wpt_agents.zoo.presets import load_preset
     from wpt_agents.zoo.stages import Shared
 
-    shared = Shared(load_preset(suite, preset, settings), suite, out / "cache", workers, device)
-    dataset = TrajectoryDataset.open(data) if data else shared.data()
-    typer.echo(f"Model: {shared.model(dataset).resolve()}")
+    chosen = load_preset(suite, preset, settings)
+    shared = Shared(chosen, suite, out / "cache", workers, device, data)
+    typer.echo(f"Model: {shared.model(shared.data()).resolve()}")
 
 
 @app.command("run", cls=Spaced)
@@ -153,6 +155,7 @@ def run_benchmark(
         int | None, typer.Option(help="Simulator frames of fine-tuning (learn.frames).")
     ] = None,
     settings: Settings = [],  # noqa: B006
+    data: Data = None,
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
@@ -170,7 +173,7 @@ def run_benchmark(
     from wpt_agents.zoo.plan import make_plan, show_plan
 
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
-    jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device)
+    jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if dry_run:
         show_plan(jobs, force)
     elif not run_all(jobs, force):

@@ -55,6 +55,7 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
             console.print(f"[red]failed[/red]: {error}\nTraceback: {job.folder / 'error.txt'}")
             continue
         console.print(report.scores_table(done))
+        say("took", ", ".join(f"{k} {v:.0f} s" for k, v in done["seconds"].items()))
         console.print(f"Run folder: [bold]{job.folder.resolve()}[/bold]")
     results = [result for job in jobs if (result := job.result())]
     if len(results) > 1:

@@ -10,6 +10,7 @@ import numpy as np
 from rich.table import Table
 from wpt_envs.tasks import Task
 
+from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.names import unknown_name
 from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
 from wpt_agents.zoo.stages import Shared, console
@@ -51,6 +52,7 @@ class Run:
     out: Path
     workers: int = 2
     device: str = "auto"
+    data: Path | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -65,7 +67,8 @@ class Run:
     @property
     def shared(self) -> Shared:
         """The stages that this run shares with others."""
-        return Shared(self.preset, self.task.suite, self.out / "cache", self.workers, self.device)
+        cache = self.out / "cache"
+        return Shared(self.preset, self.task.suite, cache, self.workers, self.device, self.data)
 
     @property
     def wpt(self) -> dict[str, Any]:
@@ -92,6 +95,7 @@ class Run:
             **about,
             "seed": self.seed,
             "preset": self.preset_name,
+            **({"data": str(self.data.resolve())} if self.data is not None else {}),
             **self.preset.as_dict(),
             "wpt": self.wpt,
         }
@@ -127,12 +131,15 @@ def make_plan(
     out: Path,
     workers: int,
     device: str,
+    data: Path | None = None,
 ) -> list[Run]:
     """One run for each task, method and seed; every name and setting is valid, or ValueError."""
     rows, resolved = find_tasks(suite, tasks), load_preset(suite, preset, settings)
     find_tasks(suite, resolved.collect.tasks)
+    if data is not None:
+        TrajectoryDataset.open(data)
     return [
-        Run(row, seed, method, preset, resolved, out, workers, device)
+        Run(row, seed, method, preset, resolved, out, workers, device, data)
         for row in rows
         for method in methods
         for seed in parse_seeds(seeds)

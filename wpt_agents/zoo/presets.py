@@ -33,6 +33,8 @@ class Section:
             if not _fits(value, types[key]):
                 name = getattr(types[key], "__name__", types[key])
                 raise ValueError(f"{title}.{key} must be of type {name}, got {value!r}.")
+            if types[key] is int and value < 0:
+                raise ValueError(f"{title}.{key} must not be negative, got {value}.")
         return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
@@ -102,8 +104,12 @@ class Preset:
     wpt: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.learn.frames < self.env.action_repeat:
-            raise ValueError(f"learn.frames must be at least one step, got {self.learn.frames}.")
+        if min(self.env.action_repeat, self.evaluate.episodes) < 1 or self.steps < 1:
+            raise ValueError(
+                "env.action_repeat, evaluate.episodes and learn.frames / env.action_repeat must be "
+                f"at least 1, got {self.env.action_repeat}, {self.evaluate.episodes} and "
+                f"{self.learn.frames} frames."
+            )
         for key in self.wpt:
             if key not in wpt_keywords():
                 raise unknown_name("WPT keyword", key, wpt_keywords())

@@ -63,6 +63,7 @@ class Shared:
     :param cache: the folder that holds them
     :param workers: processes that collect
     :param device: where to pre-train
+    :param given_data: a dataset to use in the place of the preset's
     """
 
     preset: Preset
@@ -70,6 +71,7 @@ class Shared:
     cache: Path
     workers: int = 2
     device: str = "auto"
+    given_data: Path | None = None
 
     @property
     def env(self) -> dict[str, Any]:
@@ -84,13 +86,20 @@ class Shared:
     @property
     def data_path(self) -> Path:
         """The dataset's folder."""
+        if self.given_data is not None:
+            return self.given_data.resolve()
         return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
 
     @property
     def model_path(self) -> Path:
         """The folder of the pre-training: model, log, and `done.json` when it is finished."""
-        parts = asdict(self.preset.pretrain), self.pretraining, self.data_path.name
+        parts = asdict(self.preset.pretrain), self.pretraining, self.data_source
         return self.cache / f"model-{key(*parts)}"
+
+    @property
+    def data_source(self) -> str:
+        """What the data are, however far `cache` is moved."""
+        return self.data_path.name if self.given_data is None else str(self.data_path)
 
     @property
     def pretraining(self) -> dict[str, Any]:
@@ -99,6 +108,10 @@ class Shared:
 
     def data(self) -> TrajectoryDataset:
         """Stage 1: the dataset, collected unless it is there; half of one is continued."""
+        if self.given_data is not None:
+            dataset = TrajectoryDataset.open(self.given_data)
+            say("collect", f"given, {len(dataset)} episodes  [dim]{self.data_path}")
+            return dataset
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
             found = len(TrajectoryDataset.open(self.data_path)) if self.data_path.exists() else 0

@@ -11,8 +11,11 @@ Example::
 import hashlib
 import inspect
 import os
+import shutil
 import tempfile
 import time
+import warnings
+import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
@@ -181,8 +184,7 @@ class WPT(BaseAlgorithm):
             seed=seed,
             support_multi_env=True,
         )
-        self.hyperparameters["seed"] = seed
-        self.stream_seed = int(np.random.SeedSequence().entropy % 2**31) if seed is None else seed
+        self.stream_seed = int(np.random.SeedSequence().entropy % 2**31)  # unless a seed is given
         self.observation_space, self.n_envs = IMAGE_SPACE, 1
         self.action_space = spaces.Box(-1.0, 1.0, (max_action_dim,), np.float32)
         self.schedule = parse_schedule(guidance)
@@ -192,6 +194,8 @@ class WPT(BaseAlgorithm):
         self.retrieved_ids: list[int] = []
         self.cloned, self.episodes, self.updates, self.credit = False, 0, 0, 0.0
         self._rollout: Rollout | None = None
+        self._seen_length: int | None = None  # of the last episode
+        self._windows_drawn = 0
         if _init_setup_model:
             self._setup_model()
         self.set_dataset(dataset)
@@ -216,6 +220,12 @@ class WPT(BaseAlgorithm):
         self.policy.generator = Generator(self.device).manual_seed(self.stream_seed)
         self._setup_optimizers()
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seeds all that is drawn from now on, and the environment's next reset."""
+        if seed is not None:
+            self.seed = self.stream_seed = seed
+        super().set_random_seed(seed)
+
     def _setup_optimizers(self) -> None:
         policy, model_rate = self.policy, float(self.learning_rate)
         rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
@@ -236,11 +246,11 @@ class WPT(BaseAlgorithm):
         if isinstance(dataset, str | os.PathLike):
             dataset = TrajectoryDataset.open(dataset)
         elif not isinstance(dataset, TrajectoryDataset):
-            self._scratch = tempfile.TemporaryDirectory(prefix="wpt_dataset_")
-            with TrajectoryDataset.create(Path(self._scratch.name) / "data") as store:
-                for trajectory in dataset:
-                    store.append(trajectory)
-            dataset = TrajectoryDataset.open(store.path)
+            store = TrajectoryDataset.create(tempfile.mkdtemp(prefix="wpt_dataset_"))
+            weakref.finalize(store, shutil.rmtree, store.path, ignore_errors=True)
+            with store:
+                store.extend(dataset)
+            dataset = store
         check_dataset(dataset, self.max_action_dim, self.batch_length)
         self.dataset = dataset
 
@@ -271,7 +281,7 @@ class WPT(BaseAlgorithm):
         self.policy.set_action_space(wrapped.action_space)
         if force_reset:
             self._last_obs = None
-        self._rollout = None
+        self._rollout = self._seen_length = None
         if self.seed is not None:
             wrapped.seed(self.seed)
 
@@ -314,7 +324,7 @@ class WPT(BaseAlgorithm):
         model.set_dataset(dataset)
         path = Path(run_dir) / "model.zip" if run_dir is not None else None
         if path is not None and path.exists():
-            model._restore(path, ("size", "max_action_dim", "batch_size", "batch_length"))
+            model._take(*read_model(path), ("size", "max_action_dim", "batch_size", "batch_length"))
         model._pretrain(steps, path, progress_bar, callback)
         if env is not None:
             model.set_env(env)
@@ -380,6 +390,9 @@ class WPT(BaseAlgorithm):
                 if not self._collect(callback, log_interval):
                     break
                 self._update_models()
+        except BaseException:
+            self._last_obs = None  # open episodes may lack a step: the next call begins new ones
+            raise
         finally:
             callback.on_training_end()
         return self
@@ -389,7 +402,7 @@ class WPT(BaseAlgorithm):
         guided = parse_schedule(self.guidance)(0) > 0
         if self.dataset is None or self.retrieved is not None or not (guided or self.offline_ratio):
             return
-        if not self.retrieved_ids:
+        if not self.retrieved_ids or max(self.retrieved_ids) >= len(self.dataset):
             query = self.embed(to_images(self._last_obs)[0][:1])[0]
             self.retrieved_ids = self._search(query, progress_bar)
         self.retrieved = ReplayBuffer()
@@ -413,12 +426,17 @@ class WPT(BaseAlgorithm):
         assert self.dataset is not None
         encoder_id = self.encoder_id()
         path = Path(self.dataset.path) / f"retrieval-{encoder_id[:12]}.index"
-        if path.exists():
+        whole = len(self.dataset) == len(TrajectoryDataset.open(path.parent))  # not a subset
+        if whole and path.exists():
             retriever = Retriever.load(path, encoder_id)
             if len(retriever) == len(self.dataset):
                 return retriever
         retriever = Retriever.build(self.dataset, self.embed, encoder_id, progress_bar)
-        retriever.save(path)
+        try:
+            if whole:
+                retriever.save(path)
+        except OSError as error:
+            warnings.warn(f"The index is kept in memory only: {error}", stacklevel=2)
         return retriever
 
     @torch.no_grad()
@@ -461,8 +479,8 @@ class WPT(BaseAlgorithm):
         assert self.env is not None
         rollout = self._open_rollout()
         callback.on_rollout_start()
-        ended = False
-        while not ended and self.num_timesteps < self._total_timesteps:
+        go_on, ended = True, False
+        while go_on and not ended and self.num_timesteps < self._total_timesteps:
             image, _ = to_images(self._last_obs)
             action = rollout.act(image, self._guide())
             new_obs, rewards, dones, infos = self.env.step(self.policy.to_env(action))
@@ -471,18 +489,18 @@ class WPT(BaseAlgorithm):
             if self.num_timesteps > self.learning_starts:
                 self.credit += self.n_envs
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
+            go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             for trajectory in rollout.end_step(rewards, dones, last_images(infos, dones)):
                 self.replay_buffer.add(trajectory)
-                self.episode_length = len(trajectory)
+                self._seen_length = len(trajectory)
                 self.episodes += 1
                 self._log_episodes(log_interval)
             self._last_obs, self._last_episode_starts = new_obs, dones
             ended = bool(dones.any())
-        callback.on_rollout_end()
-        return True
+        if go_on:
+            callback.on_rollout_end()
+        return go_on
 
     def _open_rollout(self) -> Rollout:
         if self._rollout is None or self._last_episode_starts.all():
@@ -497,15 +515,15 @@ class WPT(BaseAlgorithm):
         if self.num_timesteps < self.warmup_steps:
             return 0, length
         probability = self.schedule(self.num_timesteps) if self.cloned else 0.0
-        self._windows_drawn = getattr(self, "_windows_drawn", 0) + 1
+        self._windows_drawn += 1
         return draw_window(probability, length, self._stream(WINDOW, self._windows_drawn))
 
     def _episode_length(self) -> int:
-        if self.episode_length is None:
+        if self._seen_length is None:
             assert self.env is not None
             spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
-            self.episode_length = getattr(spec, "max_episode_steps", None) or 500
-        return self.episode_length
+            self._seen_length = getattr(spec, "max_episode_steps", None) or 500
+        return self.episode_length or self._seen_length
 
     def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
         if self.cloned:
@@ -516,7 +534,7 @@ class WPT(BaseAlgorithm):
 
     def _update_models(self) -> None:
         """The gradient steps that the collected steps have earned."""
-        if not self.replay_buffer.trajectories:
+        if not self.replay_buffer.trajectories or self.train_ratio == 0:
             return
         per_update = self.batch_size * self.batch_length
         updates = int(self.credit * self.train_ratio / per_update)
@@ -587,9 +605,13 @@ class WPT(BaseAlgorithm):
                 reward = model.reward(feat[:, :-1])
             value = policy.target_critic.value(feat)
             returns = lambda_return(reward, value, self.gamma, self.lam)
-            scale = self._return_scale(returns)
+            spread = scale = torch.ones_like(policy.return_scale)
+            if self.return_norm:
+                spread = policy.return_scale.lerp(return_range(returns), 0.01)
+                scale = spread.clamp_min(1.0)
             loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
         actor_norm = self._descend(self.actor_optimizer, loss, "actor")
+        policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():
             logits = policy.critic(feat[:, :-1].detach())
             value_loss = critic_loss(logits, returns, self.gamma)
@@ -602,17 +624,11 @@ class WPT(BaseAlgorithm):
             "imagined_reward": reward.mean(),
             "entropy": dream.entropy.mean(),
             "saturated_actions": dream.saturated,
-            "return_scale": torch.as_tensor(scale),
+            "return_scale": scale,
             "actor_grad_norm": actor_norm,
             "critic_grad_norm": critic_norm,
         }.items():
             metrics[f"train/{key}"].append(tensor.detach())
-
-    def _return_scale(self, returns: Tensor) -> Tensor | float:
-        if not self.return_norm:
-            return 1.0
-        self.policy.return_scale.lerp_(return_range(returns), 0.01)
-        return self.policy.return_scale.clamp_min(1.0).clone()
 
     def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
         """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
@@ -743,7 +759,7 @@ class WPT(BaseAlgorithm):
         :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
         :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
         """
-        if isinstance(path, str | os.PathLike) and not Path(path).exists():
+        if isinstance(path, str | os.PathLike) and not Path(path).suffix:
             path = Path(path).with_suffix(".zip")
         cls._check_keywords(kwargs)
         about, tensors = read_model(path)
@@ -751,23 +767,24 @@ class WPT(BaseAlgorithm):
         low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
         model.action_space = spaces.Box(low, high)
         model.policy.set_action_space(model.action_space)
-        model._take(about, tensors)
+        model._take(about, tensors, ("size", "max_action_dim"))
         if env is not None:
             model.set_env(env, force_reset)
         return model
 
-    def _restore(self, path: Path, same: Iterable[str]) -> None:
-        about, tensors = read_model(path)
+    def _take(
+        self,
+        about: Mapping[str, Any],
+        tensors: Mapping[str, dict[str, Tensor]],
+        same: Iterable[str],
+    ) -> None:
         for name in same:
             was, now = about["hyperparameters"][name], self.hyperparameters[name]
             if was != now:
                 raise ValueError(
-                    f"{path} was trained with {name}={was!r}, now it is {now!r}; "
-                    "name another run_dir, or the old value"
+                    f"The model was trained with {name}={was!r}, now it is {now!r}; "
+                    "give the old value, or another model file or run_dir"
                 )
-        self._take(about, tensors)
-
-    def _take(self, about: Mapping[str, Any], tensors: Mapping[str, dict[str, Tensor]]) -> None:
         self.policy.load_state_dict(tensors["policy"])
         for name in self._get_torch_save_params()[0][1:]:
             load_optimizer(getattr(self, name), tensors[name])

@@ -1,0 +1,385 @@
+"""Algorithm 1 from end to end, and each of its stages on its own."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch
+from debug_agent import (
+    SETTINGS,
+    ClockEnv,
+    agent,
+    noise,
+    on_time,
+    pretrained,
+    recorded,
+    same,
+    weights,
+)
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_env import LENGTH, DotEnv
+
+from wpt_agents import wpt
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.retrieval import Retriever
+from wpt_agents.rollout import Rollout
+from wpt_agents.trajectory import Trajectory
+from wpt_agents.wpt import WPT
+
+
+@pytest.fixture
+def store(tmp_path):
+    """Four dots of two actions, and two of four."""
+    with TrajectoryDataset.create(tmp_path / "data") as dataset:
+        dataset.extend(recorded(seed=i, embodiment="dot") for i in range(4))
+        dataset.extend(recorded(seed=i, actions=4, embodiment="wide") for i in range(2))
+    return dataset
+
+
+# ------------------------------------------------------------------------------- end to end
+
+
+def test_algorithm_1_from_reward_free_data_to_actions(store):
+    model = WPT.pretrain(store.path, env=DotEnv(), steps=2, **SETTINGS)
+    before = weights(model, "actor", "critic", "world_model", "prior_actor")
+    assert model.learn(3 * LENGTH) is model
+    after = weights(model, "actor", "critic", "world_model", "prior_actor")
+    assert model.num_timesteps == len(model.replay_buffer) == 3 * LENGTH
+    assert len(model.retrieved.trajectories) == 3 and model.prior is not None
+    moved = {k.split(".")[0] for k in before if (before[k] != after[k]).any()}
+    assert moved == {"actor", "critic", "world_model", "prior_actor"}
+    action, _ = model.predict(noise(2), deterministic=True)
+    assert action.shape == (2, 2)
+
+
+def test_every_switch_off_is_learning_from_scratch(store):
+    model = agent(DotEnv(), offline_ratio=0, guidance=0, dataset=store).learn(2 * LENGTH)
+    assert model.retrieved is None and model.prior is None and model.updates > 0
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not(store):
+    one, same_seed, other = (
+        pretrained(store, env=DotEnv(), seed=seed).learn(2 * LENGTH) for seed in (0, 0, 1)
+    )
+    assert same(weights(one), weights(same_seed))
+    assert not same(weights(one), weights(other))
+
+
+def test_a_reseeded_model_draws_anew():
+    one, other = agent(DotEnv()), agent(DotEnv(), seed=3)
+    other.set_random_seed(0)
+    other.policy.load_state_dict(one.policy.state_dict())
+    assert same(weights(one.learn(2 * LENGTH)), weights(other.learn(2 * LENGTH)))
+
+
+# ------------------------------------------------------------------------------ pre-training
+
+
+def test_pretraining_teaches_the_world_model_and_nothing_else(store):
+    start, end = agent(), pretrained(store)
+    moved = {k for k, v in weights(start).items() if (v != weights(end)[k]).any()}
+    assert moved and all(k.startswith("world_model") for k in moved)
+    assert not any("reward_head" in k for k in moved)
+    assert end.num_timesteps == end.updates == 0
+
+
+def test_pretraining_calls_back_after_every_update_with_finite_metrics(store):
+    seen = []
+    pretrained(store, steps=3, callback=lambda step, metrics: seen.append((step, metrics)))
+    assert [step for step, _ in seen] == [1, 2, 3]
+    assert all("train/kl" in m and np.isfinite(list(m.values())).all() for _, m in seen)
+
+
+def test_pretraining_shows_the_time_left(store, capfd):
+    pretrained(store, progress_bar=True)
+    assert "2/2" in capfd.readouterr().err
+
+
+def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
+    pretrained(store, steps=2, run_dir=tmp_path)
+    parts, whole = pretrained(store, steps=5, run_dir=tmp_path), pretrained(store, steps=5)
+    assert same(weights(parts), weights(whole))
+    # the optimiser's averages too: another step keeps them equal
+    batch = store.sample(2, 4, 4, np.random.default_rng(0))
+    for model in (parts, whole):
+        model._update_world_model(batch, defaultdict(list))
+    assert same(weights(parts), weights(whole))
+
+
+def test_killed_pretraining_goes_on_from_its_last_checkpoint(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(wpt, "EVERY", 2)
+
+    def stop(step, _):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pretrained(store, steps=4, run_dir=tmp_path, callback=stop)
+    steps = []
+    resumed = pretrained(store, steps=4, run_dir=tmp_path, callback=lambda k, _: steps.append(k))
+    assert steps == [3, 4]
+    assert same(weights(resumed), weights(pretrained(store, steps=4)))
+
+
+def test_finished_pretraining_is_only_loaded(store, tmp_path):
+    first, calls = pretrained(store, run_dir=tmp_path), []
+    again = pretrained(store, run_dir=tmp_path, callback=lambda *_: calls.append(1))
+    assert not calls and same(weights(first), weights(again))
+
+
+def test_pretraining_refuses_the_run_folder_of_other_settings(store, tmp_path):
+    pretrained(store, run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"batch_size=2, now it is 3.*run_dir"):
+        pretrained(store, run_dir=tmp_path, batch_size=3)
+
+
+def test_pretraining_takes_trajectories_from_any_iterable():
+    model = pretrained(recorded(seed=i) for i in range(3))
+    assert len(model.dataset) == 3
+
+
+# --------------------------------------------------------------------------------- retrieval
+
+
+def test_retrieval_keeps_to_the_width_takes_each_once_and_hides_rewards(store):
+    with store:
+        store.append(recorded(seed=9, reward=np.ones(8)))
+    model = pretrained(store, env=DotEnv(), num_retrieve=500).learn(1)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3, 6]
+    assert all(t.reward is None for t in model.retrieved.trajectories)
+
+
+def test_retrieval_keeps_to_the_embodiment_when_the_data_names_it(store):
+    with store:
+        store.append(recorded(seed=9, embodiment="other"))
+    model = pretrained(store, env=DotEnv(), num_retrieve=500, embodiment="other").learn(1)
+    assert model.retrieved_ids == [6]
+
+
+def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
+    model = pretrained(store, num_retrieve=1)
+    model.set_env(DotEnv())
+    model.env.seed(2)
+    assert model.learn(1).retrieved_ids == [2]
+
+
+def test_retrieval_without_data_of_the_width_says_what_to_do(store):
+    model = pretrained(store, env=DotEnv(actions=3))
+    with pytest.raises(ValueError, match=r"no trajectory of 3 actions.*offline_ratio=0"):
+        model.learn(1)
+
+
+def test_the_index_is_kept_beside_the_dataset_and_used_again(store, monkeypatch):
+    pretrained(store).build_index()
+    monkeypatch.setattr(Retriever, "build", None)
+    assert len(pretrained(store).build_index()) == 6
+
+
+def test_the_index_is_built_again_when_the_dataset_has_grown(store):
+    pretrained(store).build_index()
+    model = pretrained(store)
+    with store:
+        store.append(recorded(seed=9))
+    model.set_dataset(store.path)
+    assert len(model.build_index()) == 7
+
+
+def test_an_index_of_another_encoder_is_refused(store):
+    model = pretrained(store)
+    model.build_index()
+    [path] = store.path.glob("*.index")
+    Retriever(np.zeros((6, 4), np.float32), np.ones(6), [None] * 6, "another").save(path)
+    with pytest.raises(ValueError, match=r"another.*delete the file"):
+        model.build_index()
+
+
+def test_a_subset_has_an_index_of_its_own(store):
+    model = pretrained(store)
+    model.build_index()
+    for ids in ([0, 1], [2, 3]):
+        model.set_dataset(store.subset(ids))
+        first = next(store.subset(ids).first_observations())
+        np.testing.assert_array_equal(model.build_index().features, model.embed(first))
+    model.set_dataset(store)
+    assert len(model.build_index()) == 6
+
+
+def test_an_index_that_cannot_be_written_is_kept_in_memory(store, monkeypatch):
+    def read_only(*_):
+        raise PermissionError("read-only file system")
+
+    monkeypatch.setattr(Retriever, "save", read_only)
+    with pytest.warns(UserWarning, match="read-only"):
+        assert len(pretrained(store).build_index()) == 6
+
+
+# ------------------------------------------------------------------------ collection, guidance
+
+
+def by_the_prior(model, trajectory):
+    """What the prior actor does at each image of an episode, in the environment's bounds."""
+    state, actions = None, []
+    for t, image in enumerate(trajectory.image[:-1]):
+        action, state = model.prior.predict(image[None], state, np.array([t == 0]))
+        actions.append(action[0])
+    return np.stack(actions)
+
+
+def test_the_prior_actor_drives_the_warm_up_from_end_to_end(store):
+    model = pretrained(store, env=DotEnv(), warmup_steps=LENGTH, train_ratio=0).learn(LENGTH)
+    [episode] = model.replay_buffer.trajectories
+    np.testing.assert_allclose(episode.action, by_the_prior(model, episode), atol=1e-6)
+
+
+def test_the_prior_actor_drives_in_its_window_and_nowhere_else(store, monkeypatch):
+    monkeypatch.setattr(wpt, "draw_window", lambda probability, length, rng: (3, 7))
+    model = pretrained(store, env=DotEnv(), warmup_steps=0, train_ratio=0).learn(LENGTH)
+    [episode] = model.replay_buffer.trajectories
+    guided = np.isclose(episode.action, by_the_prior(model, episode), atol=1e-6).all(1)
+    assert np.flatnonzero(guided).tolist() == [3, 4, 5, 6]
+
+
+def test_guidance_is_drawn_by_the_schedule_once_an_episode(store, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(wpt, "draw_window", lambda p, length, rng: (drawn.append(p), (0, 0))[1])
+    model = pretrained(store, env=DotEnv(), warmup_steps=0, guidance="linear(1,0,50)")
+    model.learn(3 * LENGTH)
+    assert drawn == [1.0, 0.5, 0.0]
+
+
+def test_the_latent_is_filtered_with_the_action_that_was_executed(monkeypatch):
+    policy, seen = agent(DotEnv()).policy, []
+    act = policy.act
+
+    def spy(image, state, first, *args, **kwargs):
+        seen.append((state, first.copy()))
+        return act(image, state, first, *args, **kwargs)
+
+    monkeypatch.setattr(policy, "act", spy)
+    rollout = Rollout(policy, 1, lambda: (1, 3))
+    mine = np.array([[0.5, -0.25, 0, 0]], np.float32)
+    for _ in range(4):
+        rollout.act(noise(1), lambda frames: mine[: len(frames)])
+        rollout.end_step(np.zeros(1), np.zeros(1, bool), {})
+    fed = [state[2] for state, _ in seen]
+    assert not fed[0].any() and not (fed[1] == mine)[:, :2].any()
+    np.testing.assert_array_equal(fed[2], mine)
+    np.testing.assert_array_equal(fed[3], mine)
+    assert [bool(first[0]) for _, first in seen] == [True, False, False, False]
+
+
+def test_without_a_prior_actor_the_warm_up_is_uniform_and_the_actor_takes_over():
+    model = agent(DotEnv(), warmup_steps=LENGTH, train_ratio=0).learn(2 * LENGTH)
+    warm, own = (t.action for t in model.replay_buffer.trajectories)
+    # the actor of fresh weights is a normal of mean about 0; the uniform's quartiles are at 0.5
+    assert 0.3 < (np.abs(warm) > 0.5).mean() < 0.7
+    assert model._rollout.guided_steps == 0 and not (warm == own).any()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("terminates", [True, False])
+def test_episodes_are_stored_as_they_were(n_envs, terminates):
+    model = agent(DummyVecEnv([lambda: ClockEnv(terminates=terminates)] * n_envs), embodiment="x")
+    model.learn(2 * 7 * n_envs)
+    assert len(model.replay_buffer.trajectories) == 2 * n_envs
+    for trajectory in model.replay_buffer.trajectories:
+        assert on_time(trajectory) and trajectory.action_dim == 2
+        assert trajectory.terminated == terminates and trajectory.embodiment == "x"
+
+
+def test_num_timesteps_counts_every_call_of_step():
+    model = agent(DummyVecEnv([ClockEnv] * 3))
+    assert model.learn(10).num_timesteps == 12  # a lower bound
+    assert model.learn(7, reset_num_timesteps=False).num_timesteps == 21
+    assert model.learn(5).num_timesteps == 6
+
+
+def test_updates_follow_the_train_ratio():
+    model = agent(ClockEnv(), learning_starts=14, train_ratio=4).learn(42)
+    # 42 - 14 steps, each replayed 4 times, 2 x 4 in an update
+    assert model.updates == 28 * 4 // 8
+
+
+def test_learning_in_two_calls_equals_one():
+    whole, parts = agent(DotEnv()).learn(4 * LENGTH), agent(DotEnv()).learn(2 * LENGTH)
+    parts.learn(2 * LENGTH, reset_num_timesteps=False)
+    assert same(weights(whole), weights(parts))
+
+
+def test_an_episode_goes_on_where_the_last_learn_left_it():
+    model = agent(ClockEnv()).learn(10)
+    model.learn(11, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+class StopAt(BaseCallback):
+    def __init__(self, step, error=None):
+        super().__init__()
+        self.step, self.error, self.ended = step, error, False
+
+    def _on_step(self):
+        if self.num_timesteps == self.step and self.error is not None:
+            raise self.error
+        return self.num_timesteps != self.step
+
+    def _on_training_end(self):
+        self.ended = True
+
+
+def test_an_episode_goes_on_where_a_callback_stopped_it():
+    model, stop = agent(ClockEnv()), StopAt(10)
+    assert model.learn(100, callback=stop).num_timesteps == 10 and stop.ended
+    model.learn(11, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_an_interrupted_step_costs_the_open_episode_and_no_more():
+    model, stop = agent(ClockEnv()), StopAt(10, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, callback=stop)
+    assert stop.ended
+    model.learn(14, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_a_given_episode_length_is_kept():
+    model = agent(ClockEnv(), episode_length=5).learn(14)
+    assert model.episode_length == model.hyperparameters["episode_length"] == 5
+
+
+# ------------------------------------------------------------------------------ another task
+
+
+def test_another_width_drops_behaviour_and_replay_and_keeps_the_world_model(store):
+    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
+    kept, dropped = (
+        weights(model, "world_model.rssm", "world_model.encoder"),
+        weights(model, "actor"),
+    )
+    model.set_env(DotEnv(actions=4))
+    assert same(kept, weights(model, "world_model.rssm", "world_model.encoder"))
+    assert not same(dropped, weights(model, "actor"))
+    assert len(model.replay_buffer) == 0 and model.prior is None
+    assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5]
+    assert model.replay_buffer.trajectories[0].action_dim == 4
+
+
+def test_one_pretrained_model_loads_onto_every_width(store, tmp_path):
+    pretrained(store).save(tmp_path / "model")
+    for actions in (1, 2, 4):
+        model = WPT.load(tmp_path / "model", env=ClockEnv(actions=actions)).learn(14)
+        assert model.predict(noise(), deterministic=True)[0].shape == (actions,)
+
+
+def test_open_loop_shows_the_context_and_then_a_dream(store):
+    trajectory = recorded(length=12)
+    frames = pretrained(store).open_loop(trajectory, context=4, horizon=6)
+    assert frames.shape == (10, 64, 64, 3) and frames.dtype == np.uint8
+    short = pretrained(store).open_loop(Trajectory(trajectory.image[:8], trajectory.action[:7]))
+    assert len(short) == 8
+
+
+def test_the_forward_passes_can_run_in_bfloat16(store):
+    model = pretrained(store, env=DotEnv(), precision="bf16").learn(2 * LENGTH)
+    assert all(torch.isfinite(v).all() for v in weights(model).values())

@@ -1,0 +1,125 @@
+import pytest
+import torch
+from torch import nn
+
+from wpt_agents.networks import (
+    SIZES,
+    BlockLinear,
+    ChannelNorm,
+    Decoder,
+    Encoder,
+    Head,
+    UpConv,
+    frozen,
+    to_uint8,
+    to_unit,
+)
+
+DEBUG = SIZES["debug"]
+
+
+def noise(*shape, seed=0, dtype=torch.float32):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@pytest.mark.parametrize("kernel", [5, 6])
+@pytest.mark.parametrize("width", [1, 4, 13])
+def test_upconv_is_the_transposed_convolution_gradients_too(kernel, width):
+    ours = UpConv(3, 2, kernel).double()
+    x = noise(2, 3, width, width, dtype=torch.float64).requires_grad_()
+    plain = torch.nn.functional.conv_transpose2d(x, ours.weight, ours.bias, stride=2)
+    result, leaves = ours(x), (x, ours.weight, ours.bias)
+    torch.testing.assert_close(result, plain, rtol=1e-12, atol=1e-12)
+    weight = noise(*plain.shape, seed=1, dtype=torch.float64)
+    theirs = torch.autograd.grad((plain * weight).sum(), leaves)
+    for a, b in zip(torch.autograd.grad((result * weight).sum(), leaves), theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_block_linear_is_a_block_diagonal_matrix():
+    layer = BlockLinear(6, 9, 3).double()
+    matrix = torch.block_diag(*layer.weight)  # (6, 9)
+    x = noise(4, 6, dtype=torch.float64)
+    torch.testing.assert_close(layer(x), x @ matrix + layer.bias)
+
+
+def test_block_linear_is_drawn_by_its_blocks_own_fan_in():
+    # 256 / 8 = 32 inputs a block: uniform in +-1 / sqrt(32), of std 1 / sqrt(3 * 32) = 0.102
+    torch.manual_seed(0)
+    weight = BlockLinear(256, 768, 8).weight
+    assert weight.std().item() == pytest.approx(0.102, rel=0.02)
+    assert weight.abs().max() <= 32**-0.5
+
+
+def test_channel_norm_standardises_each_pixel_over_its_channels():
+    x = 5 * noise(2, 7, 3, 4) + 2
+    centred = x - x.mean(1, keepdim=True)
+    expected = centred / (centred.square().mean(1, keepdim=True) + 1e-3).sqrt()
+    torch.testing.assert_close(ChannelNorm(7)(x), expected)
+
+
+def test_the_encoder_is_four_strided_convolutions_of_the_centred_image():
+    encoder = Encoder(4)
+    image = torch.randint(256, (2, 64, 64, 3), dtype=torch.uint8)
+    x = image.permute(0, 3, 1, 2) / 255 - 0.5
+    for i, width in zip(range(0, 12, 3), (31, 14, 6, 2), strict=True):
+        x = nn.functional.silu(encoder.layers[i + 1](encoder.layers[i](x)))
+        assert x.shape[-2:] == (width, width)
+    torch.testing.assert_close(encoder(image), x.flatten(1))
+    assert encoder.embed_dim == x.flatten(1).shape[1]
+
+
+def test_the_encoder_takes_any_leading_axes():
+    encoder = Encoder(4)
+    image = torch.randint(256, (2, 3, 64, 64, 3), dtype=torch.uint8)
+    torch.testing.assert_close(encoder(image)[1, 2], encoder(image[1, 2][None])[0])
+    assert encoder(image).shape == (2, 3, encoder.embed_dim)
+
+
+def test_the_decoder_makes_images_and_depends_on_both_parts():
+    decoder, deter, stoch = Decoder(DEBUG), noise(2, 64), noise(2, 8, 8)
+    image = decoder(deter, stoch)
+    assert image.shape == (2, 64, 64, 3)
+    for other in (decoder(deter.roll(1, 0), stoch), decoder(deter, stoch.roll(1, 0))):
+        assert not torch.allclose(image, other)
+
+
+def test_a_head_sums_its_two_parts_and_ignores_the_order_of_rows():
+    head, feat = Head(DEBUG, 2, 5), noise(3, 4, 64 + 64)
+    deter, stoch = feat[..., :64].flatten(0, 1), feat[..., 64:].flatten(0, 1)
+    expected = head.layers(head.from_deter(deter) + head.from_stoch(stoch)).view(3, 4, 5)
+    torch.testing.assert_close(head(feat), expected)
+    torch.testing.assert_close(head(feat[1:2]), expected[1:2])
+
+
+def test_a_head_started_at_zero_answers_zero_and_still_learns():
+    head = Head(DEBUG, 2, 5, zero_init=True)
+    out = head(noise(3, 128))
+    assert not out.any()
+    out.sum().backward()
+    assert head.layers[-1].weight.grad.any()
+
+
+def test_pixels_survive_the_way_to_unit_and_back():
+    pixels = torch.arange(256, dtype=torch.uint8)
+    assert to_unit(pixels)[[0, 255]].tolist() == [-0.5, 0.5]
+    assert torch.equal(to_uint8(to_unit(pixels)), pixels)
+    assert to_uint8(torch.tensor([-9.0, 9.0])).tolist() == [0, 255]
+
+
+def test_gradients_pass_through_frozen_modules_and_leave_them_alone():
+    layer, never = nn.Linear(2, 2), nn.Linear(2, 2).requires_grad_(False)
+    x = noise(1, 2).requires_grad_()
+    with frozen(layer, never):
+        out = never(layer(x)).sum()
+    out.backward()  # outside, as the update does
+    assert x.grad.any()
+    assert layer.weight.grad is None and layer.weight.requires_grad
+    assert not never.weight.requires_grad
+
+
+def test_frozen_modules_thaw_when_the_block_fails():
+    layer = nn.Linear(2, 2)
+    with pytest.raises(RuntimeError), frozen(layer):
+        raise RuntimeError
+    assert layer.weight.requires_grad

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
@@ -16,6 +17,8 @@ from wpt_agents.archive import replacing
 
 KIND, VERSION = "wpt_agents model", 1
 ABOUT, TENSORS = "about.json", ".safetensors"
+FAULTS = (zipfile.BadZipFile, SafetensorError, EOFError, OSError)
+FAULTS += (KeyError, RuntimeError, TypeError, ValueError)  # so fail zipfile and json on nonsense
 
 
 def write_model(
@@ -35,7 +38,7 @@ def _write(
     file: BinaryIO, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
     with zipfile.ZipFile(file, "w") as archive:
-        head = {"kind": KIND, "version": VERSION, **about}
+        head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **about}
         archive.writestr(ABOUT, json.dumps(head, indent=1))
         for name, group in tensors.items():
             whole = {key: tensor.detach().cpu().contiguous() for key, tensor in group.items()}
@@ -50,26 +53,43 @@ def read_model(
     :raises FileNotFoundError: no such file
     :raises ValueError: a file that is cut short, damaged, not ours, or of a newer version
     """
-    if isinstance(path, str | os.PathLike) and not Path(path).exists():
+    if not isinstance(path, str | os.PathLike):
+        return _read(path, "The file")
+    if not Path(path).exists():
         raise FileNotFoundError(f"There is no model file {path}; pass the path given to save()")
+    with open(path, "rb") as file:
+        return _read(file, str(path))
+
+
+def _read(file: BinaryIO, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            if ABOUT not in names:
-                raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
+        with zipfile.ZipFile(file) as archive:
+            groups = _members(archive)
             about = json.loads(archive.read(ABOUT))
-            if about.get("kind") != KIND:
-                raise ValueError(f"it is a {about.get('kind')!r}")
+            if about["kind"] != KIND:
+                raise ValueError(f"it is a {about['kind']!r}")
             if about["version"] > VERSION:
                 raise ValueError(f"it is of version {about['version']}: update wpt_agents")
-            groups = [n for n in names if n.endswith(TENSORS)]
-            tensors = {n.removesuffix(TENSORS): load_tensors(archive.read(n)) for n in groups}
-    except (zipfile.BadZipFile, json.JSONDecodeError, KeyError, EOFError, ValueError) as error:
+            if about.get("groups", groups) != groups:
+                raise ValueError(f"it should hold {about['groups']} and holds {groups}")
+            return about, {n: load_tensors(archive.read(n + TENSORS)) for n in groups}
+    except FAULTS as error:
         raise ValueError(
-            f"{path} is no {KIND} of version {VERSION}, or is damaged ({error}); "
+            f"{name} is no {KIND} of version {VERSION}, or is damaged ({error}); "
             "load another copy or an earlier checkpoint"
         ) from error
-    return about, tensors
+
+
+def _members(archive: zipfile.ZipFile) -> list[str]:
+    """The groups of tensors; nothing else may be there, neither pickled nor compressed."""
+    names = archive.namelist()
+    if ABOUT not in names:
+        raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
+    for info in archive.infolist():
+        known = info.filename == ABOUT or info.filename.endswith(TENSORS)
+        if not known or info.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"it holds {info.filename!r}, which is not of wpt_agents")
+    return [name.removesuffix(TENSORS) for name in names if name != ABOUT]
 
 
 def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:

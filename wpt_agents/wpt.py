@@ -400,6 +400,8 @@ class WPT(BaseAlgorithm):
     def _retrieve(self, progress_bar: bool) -> None:
         """// Experience Retrieval: the R trajectories that begin most like the task, Eq. (5)."""
         guided = parse_schedule(self.guidance)(0) > 0
+        if self.dataset is None and self.retrieved_ids and self.offline_ratio:
+            warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not (guided or self.offline_ratio):
             return
         if not self.retrieved_ids or max(self.retrieved_ids) >= len(self.dataset):

@@ -1,0 +1,167 @@
+"""README and docs say what is so: the example runs, and every name, keyword and value exists."""
+
+import inspect
+import re
+import sys
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import toy_env
+from debug_agent import agent
+from stable_baselines3.common.logger import Logger
+from wpt_envs.tasks import TASKS
+
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo import __main__ as command_line
+from wpt_agents.zoo.presets import load_preset
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+PAGES = {path.name: path.read_text() for path in (ROOT / "docs").glob("*.md")}
+TINY = {  # what the example says -> what runs here
+    "wpt/dmc-cartpole-swingup-v0": "Dot-v0",
+    "wpt/dmc-walker-stand-v0": "OtherDot-v0",
+    "episodes=30": "episodes=2",
+    "steps=1500": "steps=2",
+    '"tiny"': '"debug"',
+    "batch_size=8": "batch_size=2",
+    "batch_length=32": "batch_length=8",
+    "train_ratio=32": "train_ratio=1",
+    "learning_starts=2500": "learning_starts=25",
+    "warmup_steps=2500": "warmup_steps=25",
+    "num_retrieve=30": "num_retrieve=2",
+    "bc_steps=500": "bc_steps=2",
+    "bc_batch_size=64": "bc_batch_size=4",
+    "learn(20_000": "learn(75",
+}
+
+
+def blocks(text, language="python"):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
+
+
+def section(title):
+    return re.search(rf"## {title}\n(.*?)(?=\n## |\Z)", README, re.S)[1]
+
+
+EXAMPLE = blocks(section("The whole method in a script"))[0]
+LISTED = section("The zoo: data, runs and tables from the command line")
+COMMANDS = re.findall(r"^python -m wpt_agents\.zoo (.*)$", LISTED, re.M)
+NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name"))
+
+
+@pytest.fixture
+def dots():
+    for name in ("Dot-v0", "OtherDot-v0"):
+        gym.register(name, lambda render_mode=None: toy_env.DotEnv())
+    yield
+    for name in ("Dot-v0", "OtherDot-v0"):
+        del gym.registry[name]
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")  # says tqdm of the bar that SB3 takes
+def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
+    code = EXAMPLE
+    for given, tiny in TINY.items():
+        assert given in code, given
+        code = code.replace(given, tiny)
+    monkeypatch.chdir(tmp_path)
+    exec(code, left := {"__name__": "__main__"})
+    assert re.search(r"return \d+", capsys.readouterr().out)
+    assert left["model"].updates == (75 - 25) * 1 // (2 * 8)
+    assert len(left["model"].retrieved_ids) == 2 and (tmp_path / "swingup.zip").exists()
+
+
+def test_the_example_is_short_and_holds_valid_keywords():
+    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 22
+    pretrain = re.search(r"WPT\.pretrain\((.*?)\)\n", EXAMPLE, re.S)[1]
+    given = dict.fromkeys(re.findall(r"(\w+)=", pretrain))
+    assert given.keys() <= {*inspect.signature(WPT.pretrain).parameters, *keywords()}
+
+
+def test_ones_own_data_are_stored_as_the_readme_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image, action = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((3, 7), np.float32)
+    exec(blocks(section("Your own data"))[0], left := {"image": image, "action": action})
+    assert left["dataset"].embodiments == ["arm"]
+
+
+def keywords():
+    return set(inspect.signature(WPT.__init__).parameters)
+
+
+def test_the_table_of_the_paper_names_what_exists():
+    assert len(NAMES) >= 25
+    for name in NAMES:
+        parts = name.split(".")
+        depth = 2 if parts[0] == "zoo" else 1
+        module = import_module(".".join(["wpt_agents", *parts[:depth]]))
+        assert callable(attrgetter(".".join(parts[depth:]))(module)), name
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_of_the_readme_is_understood(command, monkeypatch, capsys):
+    words = command.replace("'", "").split()
+    monkeypatch.setattr(sys, "argv", ["zoo", words[0], "--help"])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    told = capsys.readouterr().out
+    assert all(word in told for word in words if word.startswith("--")), told
+    if words[0] == "run":
+        suite = words[words.index("--suite") + 1] if "--suite" in words else "dmc"
+        load_preset(suite, words[words.index("--preset") + 1])
+
+
+def test_every_task_and_keyword_that_is_named_exists():
+    assert set(re.findall(r"wpt/[a-z-]+-v0", README)) <= TASKS.keys()
+    assert f"registers {len(TASKS)} ids" in README
+    from wpt_envs import dmc
+
+    made = blocks(section("The tasks"))[0]
+    assert set(re.findall(r"(\w+)=", made)) <= set(inspect.signature(dmc.make).parameters)
+
+
+@pytest.mark.parametrize("text", [README, *PAGES.values()], ids=["README.md", *PAGES])
+def test_links_lead_somewhere(text):
+    folder = ROOT if text is README else ROOT / "docs"
+    for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
+        assert (folder / target).exists(), target
+
+
+def test_the_versions_in_the_readme_lie_within_the_bounds():
+    packaging = import_module("packaging.specifiers")
+    project = (ROOT / "pyproject.toml").read_text()
+    for name, version in re.findall(
+        r"([a-z0-9_-]+) (\d+\.\d+\.\d+)", section("Versions that work.*")
+    ):
+        bound = re.search(rf'"{name.replace("dm_control", "dm-control")}([<>=][^"]*)"', project)
+        assert name == "mujoco" or packaging.SpecifierSet(bound[1]).contains(version), name
+
+
+def test_every_logged_value_is_explained_and_no_other(monkeypatch):
+    seen = set()
+    monkeypatch.setattr(Logger, "dump", lambda self, step=0: seen.update(self.name_to_value))
+    agent(toy_env.DotEnv()).learn(75, log_interval=1)
+    page = PAGES["when-it-does-not-learn.md"]
+    explained = set(re.findall(r"`((?:train|rollout|time)/\w+)`", page))
+    assert explained == seen | {"rollout/success_rate"}  # which a dot does not report
+
+
+def test_rewards_on_an_episode_never_trained_on_are_compared(capsys):
+    page = PAGES["when-it-does-not-learn.md"]
+    exec(blocks(page)[0], {"env": toy_env.DotEnv(), "model": agent(toy_env.DotEnv())})
+    assert re.fullmatch(
+        r"error \d\.\d+ a step, where a step pays \d\.\d+\n", capsys.readouterr().out
+    )
+
+
+def test_the_model_file_opens_with_other_peoples_readers(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent().save("walker.zip")
+    exec(blocks(PAGES["model-file.md"])[0], left := {})
+    assert left["about"]["hyperparameters"]["size"] == "debug"
+    assert any(name.startswith("world_model.") for name in left["weights"])

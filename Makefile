@@ -51,7 +51,7 @@ rendering: $(INSTALLED)
 
 demo: rendering
 	@echo "[demo] collect, pre-train, index, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
-	@$(BIN)/python -m wpt_agents.zoo run --suite dmc --tasks cartpole-swingup --preset demo $(DEMO_ARGS)
+	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo $(DEMO_ARGS)
 
 test: rendering
 	@echo "[test] pytest $(TEST_ARGS)"

@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Collect data, pre-train world models, fine-tune them on tasks, compare the results.\n\n"
     "Start with `python -m wpt_agents.zoo list`, then "
-    "`python -m wpt_agents.zoo run --tasks cartpole-swingup --preset demo`.",
+    "`python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo`.",
 )
 
 
@@ -167,7 +167,7 @@ def run_benchmark(
     Each task, method and seed gets a run folder with its configuration, logs, model, learning
     curve, video and `result.json`. What is finished is not done again.
 
-    Example: `python -m wpt_agents.zoo run --tasks cartpole-swingup --preset demo --seeds 3`
+    Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
     from wpt_agents.zoo.benchmark import run_all
     from wpt_agents.zoo.plan import make_plan, show_plan

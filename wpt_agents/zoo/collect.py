@@ -107,7 +107,7 @@ class Job:
 
 def play(job: Job) -> list[Trajectory]:
     """The episodes of a job: a function of the job alone."""
-    scripted = job.behaviour == "scripted"
+    scripted = job.behaviour == "scripted" and _has_script(job.task)
     env = gym.make(job.task, **job.env, **({"state_in_info": True} if scripted else {}))
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
@@ -121,7 +121,7 @@ def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
     task = zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
     source = np.random.SeedSequence([job.seed, task, episode])
     rng = np.random.default_rng(source)
-    if job.behaviour == "scripted":
+    if job.behaviour == "scripted" and _has_script(job.task):
         act, name = scripted_actions(rng, job.task, SIGMAS[episode % len(SIGMAS)])
     else:
         assert env.action_space.shape is not None
@@ -149,7 +149,7 @@ def collect(
 
     :param path: a folder; a finished one is returned as it is, half of one is continued
     :param tasks: ids for `gymnasium.make`
-    :param behaviour: "noise", or "scripted" for Meta-World
+    :param behaviour: "noise", or "scripted": Meta-World's scripts with noise, elsewhere "noise"
     :param env: keyword arguments of `gymnasium.make`
     """
     _check(tasks, episodes, behaviour)
@@ -185,9 +185,13 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str) -> None:
         )
     if behaviour not in ("noise", "scripted"):
         raise ValueError(f"No behaviour {behaviour!r}. There are: noise, scripted.")
-    rows = [wpt_envs.TASKS.get(task) for task in tasks]
-    if behaviour == "scripted" and not all(row and row.suite == "metaworld" for row in rows):
+    if behaviour == "scripted" and not any(map(_has_script, tasks)):
         raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
+
+
+def _has_script(task: str) -> bool:
+    row = wpt_envs.TASKS.get(task)
+    return row is not None and row.suite == "metaworld"
 
 
 def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:

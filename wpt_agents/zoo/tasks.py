@@ -12,19 +12,21 @@ from wpt_agents.names import unknown_name
 def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
     """The tasks of a suite that match: 'walker-run', 'dmc-walker-run', or a pattern, 'walker-*'.
 
-    No pattern: the paper's tasks of the suite.
+    No pattern: the paper's tasks of the suite. A prefix may name another suite, 'dmc-walker-run'.
     """
     if suite not in (suites := {row.suite for row in table.TASKS.values()}):
         raise unknown_name("suite", suite, suites)
     if not patterns:
         return table.suite(suite)
-    rows = {row.name: row for row in table.suite(suite, paper_only=False)}
     found: dict[str, Task] = {}
     for pattern in patterns:
-        name = pattern.removeprefix("wpt/").removeprefix(f"{suite}-").removesuffix("-v0")
-        matching = {n: row for n, row in rows.items() if fnmatchcase(n, name)}
+        name = pattern.removeprefix("wpt/").removesuffix("-v0")
+        where = next((s for s in suites if name.startswith(f"{s}-")), suite)
+        name = name.removeprefix(f"{where}-")
+        rows = {row.name: row for row in table.suite(where, paper_only=False)}
+        matching = {row.id: row for n, row in rows.items() if fnmatchcase(n, name)}
         if not matching:
-            raise unknown_name(f"task in suite {suite!r} called", name, rows)
+            raise unknown_name(f"task in suite {where!r} called", name, rows)
         found |= matching
     return list(found.values())
 

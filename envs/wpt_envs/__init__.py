@@ -9,10 +9,12 @@ from typing import Any
 
 import gymnasium
 
+from wpt_envs.headless import prefer_egl
 from wpt_envs.tasks import ANT_SEQUENCE, TASKS, Task
 
 __all__ = ["ANT_SEQUENCE", "TASKS", "Task", "pixels"]
 
+prefer_egl()  # before anybody imports MuJoCo
 for _task in TASKS.values():
     gymnasium.register(
         _task.id,

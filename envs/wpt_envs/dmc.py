@@ -61,7 +61,7 @@ class DMControl(Simulated):
         super().__init__(task, seed, render_mode, fps=1 / self.dm_env.control_timestep())
         physics = self.dm_env.physics
         camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
-        self._view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
+        self.view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         with warnings.catch_warnings():  # quadruped looks its sensors up once, with np.in1d
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -77,7 +77,7 @@ class DMControl(Simulated):
         if seed is not None:
             self.dm_env.task.random.seed(seed)
         timestep = self.dm_env.reset()
-        self._view.upload_terrain()
+        self.view.upload_terrain()
         return _flat(timestep.observation), {}
 
     def step(self, action: np.ndarray) -> StepResult:

@@ -1,7 +1,8 @@
-"""Chooses how to draw without a display. Import it before mujoco or dm_control.
+"""Chooses how to draw without a display, before mujoco or dm_control is imported.
 
 On Linux with `MUJOCO_GL` unset MuJoCo asks for a window and, without a display, aborts the
-process. So `MUJOCO_GL` becomes `egl` where EGL works and `osmesa` where only that is installed.
+process. So importing this package sets it to `egl`, and the first task or renderer to `osmesa`
+if EGL does not work and OSMesa is there.
 """
 
 import ctypes
@@ -13,6 +14,7 @@ _INSTALL = (
     "`apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri` or `apt-get install libosmesa6`."
 )
 _PLATFORM_DEVICE = 0x313F  # EGL_PLATFORM_DEVICE_EXT
+_preferred_here = False
 
 
 def _egl_works() -> bool:
@@ -47,19 +49,23 @@ def _osmesa_works() -> bool:
     return False
 
 
+def prefer_egl() -> None:
+    """Sets `MUJOCO_GL` to `egl` where the user left it unset; costs nothing."""
+    global _preferred_here
+    if "MUJOCO_GL" not in os.environ and sys.platform == "linux":
+        os.environ["MUJOCO_GL"], _preferred_here = "egl", True
+
+
 def choose() -> str:
-    """Sets `MUJOCO_GL` where it is unset, and says what it is now."""
+    """Tries out what `prefer_egl` set, falls back on OSMesa, and says what it is now."""
+    global _preferred_here
     # Mesa's software rasteriser reads this when first opened, which is below. At 64 x 64 its
     # threads cost more than they bring, and a forked process would wait for them for ever.
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    if "MUJOCO_GL" not in os.environ and sys.platform == "linux":
-        if _egl_works():
-            os.environ["MUJOCO_GL"] = "egl"
-        elif _osmesa_works():
+    if _preferred_here:
+        _preferred_here = False
+        if not _egl_works():
+            if not _osmesa_works():
+                raise RuntimeError(_INSTALL)
             os.environ["MUJOCO_GL"] = "osmesa"
-        else:
-            raise RuntimeError(_INSTALL)
     return os.environ.get("MUJOCO_GL", "")
-
-
-choose()

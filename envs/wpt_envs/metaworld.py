@@ -55,7 +55,7 @@ class MetaWorld(Simulated):
     ) -> None:
         self.sawyer = _goal_observable(ALL_V3_ENVIRONMENTS[f"{task.name}-v3"]())
         super().__init__(task, seed, render_mode, fps=1 / self.sawyer.dt)
-        self._view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)
+        self.view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)
         self._frame, self._ever = 0, False
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         self.observation_space = self.sawyer.sawyer_observation_space

@@ -5,6 +5,7 @@ import os
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
@@ -12,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from wpt_envs import headless  # before mujoco: it chooses the GL backend
+from wpt_envs.headless import choose
+from wpt_envs.meshes import thin_meshes
 
-# isort: split
-import mujoco
+choose()  # before MuJoCo reads it
+import mujoco  # noqa: E402
 
 _FLAGS = {
     "shadow": mujoco.mjtRndFlag.mjRND_SHADOW,
@@ -34,18 +36,29 @@ class Quality:
     supersample: int = 1  # draws so many times larger, then averages
     shadow_size: int | None = None  # texels of the shadow map
     tessellation: tuple[int, int, int] | None = None  # slices, stacks, quads of round shapes
-    cell: float | None = None  # meshes are thinned to one vertex in a cell of this many metres
+    floor_spacing: float = 1  # widens the grid on which a floor is lit
+    cell: float = 0  # vertices of a mesh this near are merged, in metres
+    faces: int | None = None  # the most triangles that a mesh is drawn with
     off: tuple[str, ...] = ()
 
 
 QUALITIES = {
     "exact": Quality(),
-    "near": Quality(samples=4, shadow_size=256, tessellation=(12, 6, 2), cell=0.005),
+    "near": Quality(
+        samples=4,
+        shadow_size=512,
+        tessellation=(14, 7, 2),
+        floor_spacing=1.4,
+        cell=0.001,
+        faces=2800,
+    ),
     "fast": Quality(
         samples=0,
         supersample=2,
-        tessellation=(12, 6, 2),
+        tessellation=(10, 5, 1),
+        floor_spacing=2,
         cell=0.005,
+        faces=600,
         off=("shadow", "reflection"),
     ),
 }
@@ -139,11 +152,19 @@ class View:
         camera: Camera = -1,
         upright: bool = False,
     ) -> None:
+        _quality(rendering)
+        self.camera = camera
         fixed = _camera(model, camera).fixedcamid
         flip = upright and fixed >= 0 and _hangs(model, data, fixed)
         self._new = partial(Renderer, model, data, rendering=rendering, camera=camera, flip=flip)
         self._renderers: dict[int, Renderer] = {}
-        _quality(rendering)
+
+    def at(self, rendering: str) -> "View":
+        """A view by the same camera at another rendering."""
+        other = copy(self)
+        other._new = partial(self._new, rendering=rendering)
+        other._renderers = {}
+        return other
 
     def look(self, size: int) -> np.ndarray:
         """The picture now: (size, size, 3) uint8."""
@@ -203,7 +224,7 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _egl() -> ModuleType | None:
-    if headless.choose() != "egl":
+    if choose() != "egl":
         return None
     import mujoco.egl
 
@@ -216,10 +237,10 @@ def _new_gl(side: int) -> Any:
         from mujoco.gl_context import GLContext
 
         return GLContext(side, side)
-    first = egl.EGL_DISPLAY is None
     context = egl.GLContext(side, side)
-    if first:  # dm_control shares the display and frees its contexts later than this would end it
-        atexit.unregister(egl.EGL.eglTerminate)
+    # MuJoCo and dm_control share one display, and each ends it when Python exits, too early for
+    # the other's contexts; it ends with the process anyway.
+    atexit.unregister(egl.EGL.eglTerminate)
     return context
 
 
@@ -253,59 +274,32 @@ def _free(gl: Any, mjr: mujoco.MjrContext, process: int) -> None:
 @contextmanager
 def _lowered(model: mujoco.MjModel, quality: Quality, side: int) -> Iterator[None]:
     """Lowers what a GL context reads of the model while it is made, then puts all of it back."""
-    drawing = model.vis.quality, model.vis.global_
-    wanted = {"offwidth": side, "offheight": side}
-    if quality.samples is not None:
-        wanted["offsamples"] = quality.samples
-    if quality.shadow_size is not None:
-        wanted["shadowsize"] = quality.shadow_size
-    if quality.tessellation is not None:
-        wanted |= dict(
-            zip(("numslices", "numstacks", "numquads"), quality.tessellation, strict=True)
-        )
-    before = [
-        (part, name, getattr(part, name))
-        for part in drawing
-        for name in wanted
-        if hasattr(part, name)
+    detail, window = model.vis.quality, model.vis.global_
+    slices, stacks, quads = quality.tessellation or (None, None, None)
+    numbers = [
+        (window, "offwidth", side),
+        (window, "offheight", side),
+        (detail, "offsamples", quality.samples),
+        (detail, "shadowsize", quality.shadow_size),
+        (detail, "numslices", slices),
+        (detail, "numstacks", stacks),
+        (detail, "numquads", quads),
     ]
-    arrays = [
-        (array, array.copy())
-        for array in (
-            model.mesh_facenum,
-            model.mesh_face,
-            model.mesh_facenormal,
-            model.mesh_facetexcoord,
-        )
-    ]
+    names = ("geom_size", "mesh_vert", "mesh_facenum", "mesh_face", "mesh_facenormal")
+    arrays = [getattr(model, name) for name in (*names, "mesh_facetexcoord")]
+    kept_numbers = [(part, name, getattr(part, name)) for part, name, _ in numbers]
+    kept_arrays = [array.copy() for array in arrays]
     try:
-        for part, name, _ in before:
-            setattr(part, name, wanted[name])
-        if quality.cell is not None:
-            _thin_meshes(model, quality.cell)
+        for part, name, value in numbers:
+            if value is not None:
+                setattr(part, name, value)
+        floors = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        model.geom_size[floors, 2] *= quality.floor_spacing
+        if quality.faces is not None:
+            thin_meshes(model, quality.cell, quality.faces)
         yield
     finally:
-        for part, name, value in before:
+        for part, name, value in kept_numbers:
             setattr(part, name, value)
-        for array, value in arrays:
+        for array, value in zip(arrays, kept_arrays, strict=True):
             array[:] = value
-
-
-def _thin_meshes(model: mujoco.MjModel, cell: float) -> None:
-    """Merges the vertices of each mesh that share a cell, and drops the faces this flattens."""
-    for mesh in range(model.nmesh):
-        start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        first, vertices = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        keys = np.floor(model.mesh_vert[first : first + vertices] / cell).astype(np.int64)
-        _, chosen, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        faces = model.mesh_face[start : start + count].copy()
-        corners = group.reshape(-1)[faces]
-        a, b, c = corners.T
-        kept = np.flatnonzero((a != b) & (b != c) & (c != a))
-        _, unique = np.unique(np.sort(corners[kept], axis=1), axis=0, return_index=True)
-        kept = kept[np.sort(unique)]
-        target = slice(start, start + len(kept))
-        model.mesh_face[target] = chosen[corners[kept]]
-        for array in (model.mesh_facenormal, model.mesh_facetexcoord):
-            array[target] = array[start : start + count][kept]
-        model.mesh_facenum[mesh] = len(kept)

@@ -70,7 +70,7 @@ class Robotics(Simulated):
         self.robot = gym.make(_IDS[task.name], disable_env_checker=True).unwrapped
         super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)
         usual = self.robot.mujoco_renderer.default_cam_config
-        self._view = View(
+        self.view = View(
             self.robot.model, self.robot.data, rendering, usual if camera is None else camera
         )
         self._frame, self._ever = 0, False

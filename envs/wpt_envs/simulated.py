@@ -10,10 +10,10 @@ from wpt_envs.tasks import Task
 
 
 class Simulated(gym.Env):
-    """Observes the state; is looked at through `look`. Subclasses reset, step and set `_view`."""
+    """Observes the state; is looked at through `look`. Subclasses reset, step and set `view`."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
-    _view: View
+    view: View
 
     def __init__(self, task: Task, seed: int | None, render_mode: str | None, fps: float) -> None:
         self.task, self.render_mode = task, render_mode
@@ -22,7 +22,7 @@ class Simulated(gym.Env):
 
     def look(self, size: int) -> np.ndarray:
         """The picture now: (size, size, 3) uint8."""
-        return self._view.look(size)
+        return self.view.look(size)
 
     def render(self) -> np.ndarray | None:
         """The picture at 240 x 240."""
@@ -30,7 +30,7 @@ class Simulated(gym.Env):
 
     def close(self) -> None:
         """Frees the GL contexts."""
-        self._view.close()
+        self.view.close()
 
     def _seeded(self, seed: int | None) -> int | None:
         """The seed of this reset: the one given, else at the first reset the constructor's."""

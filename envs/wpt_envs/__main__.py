@@ -1,0 +1,65 @@
+"""python -m wpt_envs {list, montage, likeness, speed}: the tasks, their looks and their cost."""
+
+import argparse
+from pathlib import Path
+
+from wpt_envs.tasks import TASKS
+
+
+def main() -> None:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(prog="python -m wpt_envs", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="the table of tasks")
+    montage = commands.add_parser("montage", help="exact | near | fast of every task, as a picture")
+    montage.add_argument("path", type=Path)
+    montage.add_argument("--size", type=int, default=64)
+    likeness = commands.add_parser("likeness", help="PSNR in dB against exact")
+    likeness.add_argument("--states", type=int, default=20)
+    speed = commands.add_parser("speed", help="CPU ms an agent step, beside the usual renderer")
+    speed.add_argument("--steps", type=int, default=40)
+    arguments = vars(parser.parse_args())
+    {"list": _list, "montage": _montage, "likeness": _likeness, "speed": _speed}[
+        arguments.pop("command")
+    ](**arguments)
+
+
+def _list() -> None:
+    print(f"{'id':44s} {'embodiment':12s} {'actions':>7s} {'frames':>6s} {'metric':8s} paper")
+    for task in TASKS.values():
+        print(
+            f"{task.id:44s} {task.embodiment:12s} {task.action_dim:7d} {task.frames:6d} "
+            f"{task.metric:8s} {'yes' if task.in_paper else ''}"
+        )
+
+
+def _montage(path: Path, size: int) -> None:
+    from wpt_envs.measure import montage
+
+    montage(list(TASKS.values()), path, size)
+
+
+def _likeness(states: int) -> None:
+    from wpt_envs.measure import likeness
+
+    for task in TASKS.values():
+        found = likeness(task, states)
+        print(
+            f"{task.id:44s} near {found['near']:5.1f} dB  fast {found['fast']:5.1f} dB", flush=True
+        )
+
+
+def _speed(steps: int) -> None:
+    from wpt_envs.measure import THE_FOUR, speed
+
+    for name in THE_FOUR:
+        costs = speed(TASKS[name], steps)
+        row = "  ".join(
+            f"{rendering} {cost:6.2f} ms (x{costs['usual'] / cost:4.1f})"
+            for rendering, cost in costs.items()
+        )
+        print(f"{name:32s} {row}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Measures the three renderings: how like the exact one, how quick, and side by side."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+from wpt_envs.rendering import QUALITIES, View
+from wpt_envs.simulated import Simulated
+from wpt_envs.tasks import Task
+
+THE_FOUR = (  # what the speed is quoted on
+    "wpt/dmc-walker-run-v0",
+    "wpt/dmc-quadruped-run-v0",
+    "wpt/metaworld-button-press-v0",
+    "wpt/metaworld-assembly-v0",
+)
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB; infinite for equal pictures."""
+    error = np.mean((image.astype(np.float64) - reference) ** 2)
+    return float(10 * np.log10(255**2 / error)) if error else float("inf")
+
+
+def visit_states(env: Simulated, count: int, seed: int = 0) -> Iterator[int]:
+    """Leads the simulator through `count` states of random episodes, ten control steps apart."""
+    rng = np.random.default_rng(seed)
+    for index in range(count):
+        if index % 5 == 0:
+            env.reset(seed=seed + index)
+        for _ in range(10):
+            env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        yield index
+
+
+def views(env: Simulated) -> dict[str, View]:
+    """The same camera at each of the renderings."""
+    return {rendering: env.view.at(rendering) for rendering in QUALITIES}
+
+
+def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
+    """Mean PSNR in dB of `near` and `fast` against `exact`."""
+    env = gym.make(task.id).unwrapped
+    looks = views(env)
+    found: dict[str, list[float]] = {"near": [], "fast": []}
+    for _ in visit_states(env, states):
+        exact = looks["exact"].look(size)
+        for rendering, values in found.items():
+            values.append(psnr(looks[rendering].look(size), exact))
+    for view in looks.values():
+        view.close()
+    env.close()
+    return {rendering: float(np.mean(values)) for rendering, values in found.items()}
+
+
+def step_cost(env: gym.Env, steps: int = 40) -> float:
+    """CPU milliseconds (of the process, all threads) an agent step."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(steps + 2)]
+    for action in actions[:2]:
+        env.step(action)
+    start = time.process_time()
+    for action in actions[2:]:
+        env.step(action)
+    return (time.process_time() - start) / steps * 1000
+
+
+def speed(task: Task, steps: int = 40) -> dict[str, float]:
+    """CPU ms an agent step at each rendering, and with the suite's usual renderer."""
+    costs = {}
+    for rendering in QUALITIES:
+        env = gym.make(task.id, rendering=rendering)
+        costs[rendering] = step_cost(env, steps)
+        env.close()
+    env = gym.make(task.id)
+    usual, free = _usual_renderer(env.unwrapped)
+    env.unwrapped.look = lambda size: usual()
+    costs["usual"] = step_cost(env, steps)
+    free()
+    env.close()
+    return costs
+
+
+def _usual_renderer(env: Simulated) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
+    """dm_control's `Physics.render`, or gymnasium's `MujocoRenderer`."""
+    if hasattr(env, "dm_env"):
+        physics, camera = env.dm_env.physics, env.view.camera
+        return lambda: physics.render(64, 64, camera_id=camera), lambda: None
+    from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+    simulator = env.sawyer if hasattr(env, "sawyer") else env.robot
+    named = {"camera_name": env.view.camera} if isinstance(env.view.camera, str) else {}
+    free = {"default_cam_config": env.view.camera} if not named else {}
+    renderer = MujocoRenderer(simulator.model, simulator.data, width=64, height=64, **named, **free)
+    return lambda: renderer.render("rgb_array")[::-1], renderer.close
+
+
+def montage(tasks: list[Task], path: Path, size: int = 64, columns: int = 6) -> None:
+    """Writes a picture: for each task the three renderings of one state, side by side."""
+    import imageio.v3
+
+    cells = []
+    for task in tasks:
+        env = gym.make(task.id).unwrapped
+        looks = views(env)
+        for _ in visit_states(env, 1):
+            cells.append(np.concatenate([view.look(size) for view in looks.values()], axis=1))
+        for view in looks.values():
+            view.close()
+        env.close()
+    border = [(2, 2), (4, 4), (0, 0)]
+    cells = [np.pad(cell, border, constant_values=255) for cell in cells]
+    cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[i : i + columns], 1) for i in range(0, len(cells), columns)]
+    imageio.v3.imwrite(path, np.concatenate(rows, axis=0))

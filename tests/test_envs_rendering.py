@@ -1,0 +1,186 @@
+"""The renderer: exact is exact, physics never changes, and nobody's frames are touched."""
+
+import gc
+import itertools
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import wpt_envs
+from wpt_envs import headless, measure, rendering
+
+FAMILIES = [
+    "dmc-cartpole-balance",
+    "dmc-acrobot-swingup",
+    "dmc-cheetah-run",
+    "dmc-walker-run",
+    "dmc-quadruped-run",
+    "metaworld-button-press",
+    "robotics-fetch-push",
+    "robotics-shadow-hand-block",
+    "robotics-adroit-door",
+]
+THE_FOUR = [name.removeprefix("wpt/").removesuffix("-v0") for name in measure.THE_FOUR]
+
+
+def make(name, **kwargs):
+    env = gym.make(f"wpt/{name}-v0", **kwargs)
+    env.reset(seed=0)
+    return env
+
+
+def model_of(env):
+    return env.unwrapped.view._new.args[0]
+
+
+def model_bytes(env):
+    buffer = np.empty(mujoco.mj_sizeModel(model_of(env)), np.uint8)
+    mujoco.mj_saveModel(model_of(env), None, buffer)
+    return buffer.tobytes()
+
+
+@pytest.mark.parametrize("name", ["dmc-walker-run", "dmc-quadruped-run", "dmc-acrobot-swingup"])
+def test_exact_is_dm_controls_picture(name):
+    env = make(name, rendering="exact").unwrapped
+    for _ in measure.visit_states(env, 3):
+        theirs = env.dm_env.physics.render(64, 64, camera_id=env.view.camera)
+        assert np.array_equal(env.look(64), theirs)
+
+
+@pytest.mark.parametrize("name", ["metaworld-assembly", "robotics-fetch-push"])
+def test_exact_is_gymnasiums_picture(name):
+    env = make(name, rendering="exact").unwrapped
+    usual, free = measure._usual_renderer(env)
+    for _ in measure.visit_states(env, 2):
+        theirs = usual() if name.startswith("metaworld") else usual()[::-1]
+        assert np.array_equal(env.look(64), theirs)
+    free()
+
+
+@pytest.mark.parametrize("name", THE_FOUR)
+def test_physics_is_bit_identical_under_all_renderings(name):
+    envs = [make(name, rendering=quality, state_in_info=True) for quality in rendering.QUALITIES]
+    for _ in range(4):
+        action = envs[0].action_space.sample()
+        results = [env.step(action) for env in envs]
+        assert len({result[4]["state"].tobytes() for result in results}) == 1
+        assert len({result[1] for result in results}) == 1
+
+
+@pytest.mark.parametrize("quality", ["near", "fast"])
+def test_opening_a_renderer_leaves_the_model_as_it_was(quality):
+    env = gym.make("wpt/metaworld-hammer-v0", rendering=quality).unwrapped
+    before = model_bytes(env)
+    env.look(64)
+    assert model_bytes(env) == before
+
+
+@pytest.mark.parametrize("name", THE_FOUR)
+def test_near_is_within_38_db_of_exact(name):
+    assert measure.likeness(wpt_envs.TASKS[f"wpt/{name}-v0"], states=3)["near"] >= 38
+
+
+def test_no_environment_changes_anothers_frames():
+    envs = {name: make(name, rendering="fast").unwrapped for name in FAMILIES}
+    alone = {name: env.look(64) for name, env in envs.items()}
+    for first, second in itertools.permutations(FAMILIES, 2):
+        assert np.array_equal(envs[first].look(64), alone[first])
+        assert np.array_equal(envs[second].look(64), alone[second])
+    for env in envs.values():
+        env.close()
+
+
+def test_other_peoples_renderers_keep_their_frames_too():
+    walker, press = make("dmc-walker-run").unwrapped, make("metaworld-button-press").unwrapped
+    gymnasiums, free = measure._usual_renderer(press)
+    dm_controls, _ = measure._usual_renderer(walker)
+    dm_controls()
+    alone = gymnasiums()  # its context is the current one now, and it never asks again
+    walker.look(64), press.look(64)
+    assert np.array_equal(gymnasiums(), alone)
+    free()
+
+
+def test_closing_frees_the_context_and_looking_again_makes_a_new_one():
+    env = make("dmc-acrobot-swingup", rendering="fast").unwrapped
+    before = env.look(64)
+    env.close()
+    assert np.array_equal(env.look(64), before)
+    env.close()
+
+
+def open_contexts():
+    gc.collect()
+    contexts = [thing for thing in gc.get_objects() if type(thing).__name__ == "GLContext"]
+    return sum(bool(context._context) for context in contexts)
+
+
+def test_opening_and_closing_leaks_no_context():
+    before = open_contexts()
+    env = make("dmc-cartpole-balance", rendering="fast").unwrapped
+    for _ in range(20):
+        env.look(16)
+        assert open_contexts() > before
+        env.close()
+    assert open_contexts() == before
+
+
+def test_every_size_is_drawn_on_its_own():
+    env = make("dmc-walker-run", render_size=100)
+    assert env.reset(seed=0)[0].shape == (64, 64, 3)
+    assert env.render().shape == (100, 100, 3)
+
+
+def test_a_camera_is_chosen_by_name_number_or_placement():
+    env = make("dmc-walker-run", camera="back", rendering="fast")
+    numbered = make("dmc-walker-run", camera=1, rendering="fast")
+    free = make("dmc-walker-run", camera={"distance": 9.0}, rendering="fast")
+    images = [each.reset(seed=0)[0] for each in (env, numbered, free)]
+    assert np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_an_unknown_camera_or_rendering_is_answered_with_what_there_is():
+    with pytest.raises(ValueError, match="side, back"):
+        gym.make("wpt/dmc-walker-run-v0", camera="front")
+    with pytest.raises(ValueError, match="exact, near, fast"):
+        gym.make("wpt/dmc-walker-run-v0", rendering="nice")
+
+
+def test_psnr_by_hand():
+    black = np.zeros((2, 2, 3), np.uint8)
+    assert measure.psnr(black + 51, black) == pytest.approx(20 * np.log10(5))  # 255 / 51 = 5
+    assert measure.psnr(black, black) == np.inf
+
+
+@pytest.fixture
+def unset(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(headless, "_egl_works", lambda: False)
+    headless.prefer_egl()
+    yield monkeypatch
+    headless._preferred_here = False
+
+
+def test_without_egl_osmesa_is_chosen(unset):
+    unset.setattr(headless, "_osmesa_works", lambda: True)
+    assert headless.choose() == "osmesa"
+
+
+def test_without_any_off_screen_gl_the_error_says_what_to_install(unset):
+    unset.setattr(headless, "_osmesa_works", lambda: False)
+    with pytest.raises(RuntimeError, match="apt-get install libegl1"):
+        headless.choose()
+
+
+def test_what_the_user_chose_is_kept(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    headless.prefer_egl()
+    assert headless.choose() == "glfw"
+
+
+def test_every_rendering_is_a_keyword_of_every_suite():
+    names = ("dmc-walker-run", "metaworld-reach", "robotics-fetch-reach")
+    for name, quality in itertools.product(names, rendering.QUALITIES):
+        gym.make(f"wpt/{name}-v0", rendering=quality)

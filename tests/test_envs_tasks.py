@@ -1,0 +1,59 @@
+"""The table of tasks, and what importing the package does."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import pytest
+import wpt_envs
+from wpt_envs import tasks
+
+IMPORT = """
+import sys, wpt_envs
+loaded = {"mujoco", "dm_control", "metaworld", "gymnasium_robotics", "torch"} & set(sys.modules)
+assert not loaded, loaded
+assert not [name for name in sys.modules if name.split(".")[0] == "wpt_agents"]
+"""
+
+
+def test_the_paper_has_22_dmcontrol_and_50_metaworld_tasks():
+    assert len(tasks.suite("dmc")) == 22
+    assert len(tasks.suite("metaworld")) == 50
+    assert not any(task.in_paper for task in tasks.suite("robotics", paper_only=False))
+
+
+def test_cheetah_run_hard_is_there_but_not_counted():
+    assert not wpt_envs.TASKS["wpt/dmc-cheetah-run-hard-v0"].in_paper
+
+
+def test_every_task_is_registered():
+    assert set(wpt_envs.TASKS) == {name for name in gym.registry if name.startswith("wpt/")}
+
+
+def test_importing_loads_no_simulator_no_torch_and_no_agent():
+    subprocess.run([sys.executable, "-c", IMPORT], check=True)
+
+
+def test_the_ant_sequence_is_six_quadruped_tasks_in_the_papers_order():
+    names = [wpt_envs.TASKS[name].name for name in wpt_envs.ANT_SEQUENCE]
+    wanted = ["stand", "walk", "run", "jump", "roll", "roll-fast"]
+    assert names == [f"quadruped-{name}" for name in wanted]
+
+
+def test_a_suites_width_is_that_of_its_widest_embodiment():
+    assert [tasks.suite_width(name) for name in ("dmc", "metaworld", "robotics")] == [12, 4, 30]
+
+
+def test_an_unknown_task_is_answered_with_the_nearest_names():
+    with pytest.raises(ValueError, match="walker-run"):
+        tasks.find("dmc", "walker-rum")
+
+
+def test_an_unknown_suite_is_answered_with_all_suites():
+    with pytest.raises(ValueError, match="dmc, metaworld, robotics"):
+        tasks.suite("dcm")
+
+
+def test_a_padding_which_is_no_number_is_refused():
+    with pytest.raises(ValueError, match="'suite'"):
+        tasks.pad_width("dmc", "widest")

@@ -1,0 +1,196 @@
+"""The wrappers, pixels() around any environment, and the checkers on every task."""
+
+import hashlib
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import wpt_envs
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from wpt_envs.wrappers import CheckAction, PadAction, RepeatAction, SeePixels
+
+
+class Count(gym.Env):
+    """Counts its steps; ends after five; its picture is as bright as the count."""
+
+    render_mode = "rgb_array"
+    observation_space = spaces.Box(0, 9, (1,), np.float32)
+
+    def __init__(self, discrete=False):
+        box = spaces.Box(-1, 1, (2,), np.float32)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+        self.action_space = spaces.Discrete(2) if discrete else box
+        self.count, self.actions, self.looks = 0, [], 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        self.actions.append(action)
+        return np.full(1, self.count, np.float32), 1.5, self.count >= 5, False, {}
+
+    def render(self):
+        self.looks += 1
+        return np.full((30, 40, 3), 10 * self.count, np.uint8)
+
+
+def episode_hash(name):
+    """A digest of everything that five steps bring."""
+    env = gym.make(name, rendering="fast", state_in_info=True)
+    digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
+    for step in range(5):
+        action = np.sin(step + np.arange(env.action_space.shape[0])).astype(np.float32)
+        obs, reward, *_, info = env.step(action)
+        digest.update(obs.tobytes() + np.float64(reward).tobytes() + info["state"].tobytes())
+    env.close()
+    return digest.hexdigest()
+
+
+def test_repeating_sums_rewards_and_stops_at_the_end():
+    env = RepeatAction(Count(), times=2)
+    env.reset()
+    steps = [env.step(np.zeros(2)) for _ in range(3)]
+    assert [step[1] for step in steps] == [3.0, 3.0, 1.5]
+    assert [step[2] for step in steps] == [False, False, True]
+    assert env.metadata["render_fps"] == 15
+
+
+def test_repeating_less_than_once_is_refused():
+    with pytest.raises(ValueError, match="1 or more"):
+        RepeatAction(Count(), times=0)
+
+
+def test_padding_hands_the_leading_actions_on():
+    env = PadAction(Count(), size=4)
+    env.reset()
+    env.step(np.array([0.1, 0.2, 0.3, 0.4]))
+    assert env.action_space.shape == (4,)
+    assert np.array_equal(env.unwrapped.actions[0], [0.1, 0.2])
+
+
+def test_padding_below_the_true_width_is_refused_with_both_widths():
+    with pytest.raises(ValueError, match=r"=3 is narrower than the task's 6"):
+        gym.make("wpt/dmc-walker-run-v0", pad_action_to=3)
+
+
+@pytest.mark.parametrize(
+    ("action", "complaint"),
+    [(np.zeros(3), r"shape \(3,\)"), ([0, np.nan], "NaN"), ([0, 1.5], r"outside \[-1.0, 1.0\]")],
+)
+def test_a_bad_action_is_refused_and_the_environment_goes_on(action, complaint):
+    env = CheckAction(Count())
+    env.reset()
+    with pytest.raises(ValueError, match=complaint):
+        env.step(action)
+    assert env.unwrapped.actions == []
+    env.reset()
+    env.step(np.zeros(2))
+
+
+def test_the_picture_is_taken_once_an_agent_step():
+    env = wpt_envs.pixels(Count(), action_repeat=2)
+    env.reset()
+    looks = env.unwrapped.looks
+    env.step(np.zeros(2))
+    assert env.unwrapped.looks == looks + 1
+
+
+def test_the_observation_is_the_picture_after_the_last_repeat():
+    env = wpt_envs.pixels(Count(), action_repeat=2, image_size=8, state_in_info=True)
+    env.reset()
+    obs, *_, info = env.step(np.zeros(2))
+    assert np.array_equal(obs, np.full((8, 8, 3), 20))
+    assert info["state"] == 2
+
+
+def test_changing_an_observation_changes_nothing_else():
+    env = wpt_envs.pixels(Count())
+    env.reset()[0][:] = 99
+    assert env.render().max() == 0
+
+
+def test_shrinking_averages_over_areas():
+    env = wpt_envs.pixels(Count(), image_size=1)
+    env.unwrapped.render = lambda: np.repeat([[[0], [30], [60]]], 3, axis=2).astype(np.uint8)
+    assert np.array_equal(env.reset()[0], [[[30, 30, 30]]])
+
+
+def test_discrete_actions_are_seen_and_repeated_but_not_padded():
+    env = wpt_envs.pixels(Count(discrete=True), action_repeat=2)
+    env.reset()
+    assert env.step(1)[1] == 3.0
+    with pytest.raises(ValueError, match="flat Box"):
+        wpt_envs.pixels(Count(discrete=True), pad_action_to=4)
+
+
+def test_an_environment_without_pictures_is_refused_with_the_remedy():
+    env = Count()
+    env.render_mode = None
+    with pytest.raises(ValueError, match="render_mode='rgb_array'"):
+        wpt_envs.pixels(env)
+    with pytest.raises(ValueError, match="no MuJoCo environment"):
+        wpt_envs.pixels(Count(), rendering="near")
+
+
+def test_any_mujoco_environment_is_drawn_by_our_renderer():
+    env = wpt_envs.pixels(gym.make("InvertedPendulum-v5"), rendering="fast", pad_action_to=3)
+    first, _ = env.reset(seed=0)
+    obs, *_ = env.step(np.array([1, 0, 0], np.float32))
+    assert obs.shape == (64, 64, 3) and np.ptp(obs) > 50
+    assert not np.array_equal(first, obs)
+    env.close()
+
+
+def test_rendering_answers_the_last_observation():
+    env = SeePixels(wpt_envs.pixels(Count()).env, image_size=64)
+    obs, _ = env.reset()
+    assert np.array_equal(env.render(), obs)
+
+
+@pytest.mark.parametrize("name", ["wpt/dmc-walker-run-v0", "wpt/metaworld-button-press-v0"])
+def test_a_fresh_process_has_the_same_episode(name):
+    code = f"from test_envs_wrappers import episode_hash; print(episode_hash({name!r}))"
+    run = [sys.executable, "-c", code]
+    here = __file__.rpartition("/")[0]
+    answer = subprocess.run(run, check=True, capture_output=True, text=True, cwd=here)
+    assert answer.stdout.split()[-1] == episode_hash(name)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("name", ["wpt/dmc-cheetah-run-v0", "wpt/metaworld-push-v0"])
+def test_a_forked_worker_has_the_same_episode_though_this_process_draws_too(name):
+    env = gym.make(name, rendering="fast")
+    first, _ = env.reset(seed=1)
+    vector = gym.make_vec(name, num_envs=2, vectorization_mode="async", rendering="fast")
+    firsts, _ = vector.reset(seed=0)  # the second worker is seeded by 1
+    action = np.full(env.action_space.shape, 0.5, np.float32)
+    step, steps = env.step(action), vector.step(np.stack([action, action]))
+    vector.close()
+    assert np.array_equal(firsts[1], first) and not np.array_equal(firsts[0], first)
+    assert np.array_equal(steps[0][1], step[0]) and steps[1][1] == step[1]
+
+
+WRAPPED = "ignore:.*is different from the unwrapped version"  # the pixels are wrappers, by design
+
+
+@pytest.mark.filterwarnings(WRAPPED)
+@pytest.mark.parametrize("name", wpt_envs.TASKS)
+def test_the_checkers_of_gymnasium_and_sb3_pass(name):
+    env = gym.make(name, rendering="fast", image_size=40, pad_action_to="suite", action_repeat=2)
+    check_env(env, skip_render_check=True)
+    sb3_check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.filterwarnings(WRAPPED)
+def test_the_checkers_pass_for_rendering_too():
+    env = gym.make("wpt/dmc-walker-run-v0", rendering="fast")
+    check_env(env)
+    sb3_check_env(env)

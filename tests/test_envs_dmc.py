@@ -179,3 +179,19 @@ def test_the_escape_terrain_is_drawn_as_it_is_now():
     other, _ = env.reset(seed=1)
     fresh, _ = gym.make("wpt/dmc-quadruped-escape-v0", rendering="fast").reset(seed=1)
     assert np.array_equal(other, fresh)
+
+
+def test_a_longer_floor_is_drawn_and_changes_no_physics():
+    stock, longer = (gym.make("wpt/dmc-walker-run-v0", floor=floor) for floor in (None, 3.0))
+    images = [env.reset(seed=0)[0] for env in (stock, longer)]
+    assert not np.array_equal(*images)
+    action = np.ones(6, np.float32)
+    assert stock.step(action)[1] == longer.step(action)[1]
+
+
+def test_rescaled_actions_reach_the_actuators_own_range():
+    env = gym.make("wpt/dmc-quadruped-run-v0", rescale_action=True).unwrapped
+    env.reset(seed=0)
+    env.step(np.ones(12, np.float32))
+    physics = env.dm_env.physics
+    assert np.allclose(physics.data.ctrl, physics.model.actuator_ctrlrange[:, 1])

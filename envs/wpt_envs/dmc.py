@@ -15,8 +15,10 @@ from wpt_envs.simulated import Simulated, StepResult
 from wpt_envs.wrappers import dress
 
 # isort: split
+import mujoco
 from dm_control.rl.control import Environment
 
+_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _CAMERAS = {"quadruped": 2}  # the other domains are seen by their first camera
 
 
@@ -32,10 +34,12 @@ def make(
     seed: int | None = None,
     render_mode: str | None = "rgb_array",
     render_size: int | None = None,
+    rescale_action: bool = False,
+    floor: float | None = None,
 ) -> gym.Env:
-    """A task of DMControl from pixels, for example `walker-run`."""
+    """A task of DMControl from pixels, for example `walker-run`; see `DMControl`."""
     row = tasks.find("dmc", task)
-    env = DMControl(row, rendering, camera, seed, render_mode)
+    env = DMControl(row, rendering, camera, seed, render_mode, rescale_action, floor)
     return dress(
         env,
         image_size=image_size,
@@ -47,7 +51,46 @@ def make(
 
 
 class DMControl(Simulated):
-    """One task at its control rate."""
+    """A task of DMControl at its control rate; `make` puts the pixels around it.
+
+    ## Description
+    The paper's 22 tasks of cartpole, acrobot, cheetah, walker and quadruped, `cheetah-run-hard`
+    of its Fig. 2, and the other stock tasks of these domains. Stock tasks are dm_control's own;
+    the others are written in its layout in `wpt_envs.dmc_tasks`.
+
+    ## Action Space
+    `Box(-1, 1, (n,), float32)`: n is 1 for cartpole and acrobot, 6 for cheetah and walker, 12
+    for quadruped; `pad_action_to` widens it, and entries beyond n do nothing. Actions go to the
+    actuators as they are, which clip them to their own range (the quadruped's lift is
+    [-1, 1.1], its extend [-0.8, 0.8]).
+
+    ## Observation Space
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    first camera, for quadruped by the third. dm_control's own observation, flattened, is in
+    `info["state"]` with `state_in_info`.
+
+    ## Rewards
+    The task's, 0 to 1 a control step, summed over `action_repeat`. The hard tasks give nothing
+    below a threshold (0.6, cheetah 0.2) and take 0.1 times the norm of the action.
+
+    ## Starting State
+    The task's. `reset(seed=s)` gives it `numpy.random.RandomState(s)`, as dm_control's own
+    `random=s` does; `reset()` goes on in the same stream.
+
+    ## Episode End
+    Truncated after 1000 control steps; never terminated.
+
+    ## Arguments
+    `image_size=64`, `action_repeat=2`, `pad_action_to=None` (a number, or `"suite"`: 12),
+    `rendering="near"` (`"exact"`, `"fast"`), `camera` (name, number or a free camera's
+    attributes), `state_in_info=False`, `seed` (of the first reset), `render_mode="rgb_array"`,
+    `render_size` (of `render()`; the observation's by default), `rescale_action=False` (maps
+    [-1, 1] onto the actuators' range), `floor` (half the drawn length of the floor in metres;
+    the stock walker's ends 2 m behind it).
+
+    ## Version History
+    v0: dm_control 1.0.28, mujoco 3.3.0.
+    """
 
     def __init__(
         self,
@@ -56,10 +99,16 @@ class DMControl(Simulated):
         camera: str | int | None = None,
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
+        rescale_action: bool = False,
+        floor: float | None = None,
     ) -> None:
         self.dm_env = _load(task)
         super().__init__(task, seed, render_mode, fps=1 / self.dm_env.control_timestep())
         physics = self.dm_env.physics
+        spec = self.dm_env.action_spec()
+        self._range = (spec.minimum, spec.maximum) if rescale_action else None
+        if floor is not None:  # a plane is endless to the simulator; this is what is drawn
+            physics.model.geom_size[physics.model.geom_type == _PLANE, 0] = floor
         camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
         self.view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
@@ -82,6 +131,9 @@ class DMControl(Simulated):
 
     def step(self, action: np.ndarray) -> StepResult:
         """One control step."""
+        if self._range is not None:
+            low, high = self._range
+            action = low + (action + 1) / 2 * (high - low)
         timestep = self.dm_env.step(action)
         terminated = timestep.last() and timestep.discount == 0
         truncated = timestep.last() and not terminated

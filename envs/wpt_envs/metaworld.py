@@ -30,7 +30,7 @@ def make(
     render_mode: str | None = "rgb_array",
     render_size: int | None = None,
 ) -> gym.Env:
-    """A task of Meta-World from pixels, for example `button-press`."""
+    """A task of Meta-World from pixels, for example `button-press`; see `MetaWorld`."""
     env = MetaWorld(tasks.find("metaworld", task), rendering, camera, seed, render_mode)
     return dress(
         env,
@@ -43,7 +43,41 @@ def make(
 
 
 class MetaWorld(Simulated):
-    """One task at its control rate. The state holds the goal."""
+    """A task of Meta-World at its control rate; `make` puts the pixels around it.
+
+    ## Description
+    The 50 tasks of Meta-World v3 with the Sawyer arm, its dense reward ("v2") and a goal and
+    object that are new at each reset. Not the protocol of `Meta-World/MT1`, which has 50 fixed
+    goals and 500 control steps.
+
+    ## Action Space
+    `Box(-1, 1, (4,), float32)`: the gripper's move along x, y and z, and its closing.
+
+    ## Observation Space
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    camera `corner4`. This camera hangs upside down, and its picture is turned over top to bottom
+    (not rotated), as is usual. The state of 39 numbers, with the goal, is in `info["state"]`
+    with `state_in_info`.
+
+    ## Rewards
+    Meta-World's, 0 to 10 a control step, summed over `action_repeat`.
+    `info["success"]` is success at this step, `info["success_any"]` at any step of the episode
+    so far, and `info["is_success"]` repeats `success` for Stable-Baselines3.
+
+    ## Starting State
+    Drawn at each reset. `reset(seed=s)` starts the stream anew, bit for bit; `reset()` goes on.
+
+    ## Episode End
+    Truncated after 200 control steps; never terminated, success or not.
+
+    ## Arguments
+    `image_size=64`, `action_repeat=2`, `pad_action_to=None` (a number, or `"suite"`: 4),
+    `rendering="near"` (`"exact"`, `"fast"`), `camera="corner4"`, `state_in_info=False`, `seed`
+    (of the first reset), `render_mode="rgb_array"`, `render_size` (of `render()`).
+
+    ## Version History
+    v0: metaworld 3.1.1, mujoco 3.3.0.
+    """
 
     def __init__(
         self,

@@ -43,7 +43,7 @@ def make(
     render_mode: str | None = "rgb_array",
     render_size: int | None = None,
 ) -> gym.Env:
-    """A task of Gymnasium-Robotics from pixels, for example `fetch-push`."""
+    """A task of Gymnasium-Robotics from pixels, for example `fetch-push`; see `Robotics`."""
     env = Robotics(tasks.find("robotics", task), rendering, camera, seed, render_mode)
     return dress(
         env,
@@ -56,7 +56,37 @@ def make(
 
 
 class Robotics(Simulated):
-    """One task at its control rate; the state is the flattened observation, goals included."""
+    """A task of Gymnasium-Robotics at its control rate; `make` puts the pixels around it.
+
+    ## Description
+    Fetch (reach, push, pick-and-place, slide), the Shadow hand (reach, block, egg, pen) and
+    Adroit (door, hammer, pen, relocate): further embodiments, not counted among the paper's.
+
+    ## Action Space
+    `Box(-1, 1, (n,), float32)`: n is 4 for Fetch, 20 for the Shadow hand, 24 to 30 for Adroit.
+
+    ## Observation Space
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    environment's usual camera, goal markers included. Its own observation, flattened, with the
+    goals, is in `info["state"]` with `state_in_info`.
+
+    ## Rewards
+    The environment's: Fetch and Shadow hand -1 until success, Adroit dense. `info["success"]`,
+    `info["success_any"]` and `info["is_success"]` are as in Meta-World.
+
+    ## Starting State
+    The environment's; `reset(seed=s)` starts its stream anew.
+
+    ## Episode End
+    Truncated after 50 (Fetch, hand reach), 100 (Shadow hand) or 200 (Adroit) control steps;
+    never terminated.
+
+    ## Arguments
+    As in DMControl, but `action_repeat=1`, and `pad_action_to="suite"` is 30.
+
+    ## Version History
+    v0: gymnasium-robotics 1.4.2, mujoco 3.3.0.
+    """
 
     def __init__(
         self,

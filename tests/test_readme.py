@@ -11,11 +11,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env
-from debug_agent import agent
+from debug_agent import SETTINGS, agent
 from stable_baselines3.common.logger import Logger
+from wpt_envs import dmc
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.wpt import WPT
 from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo.presets import load_preset
 
@@ -23,20 +23,14 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 PAGES = {path.name: path.read_text() for path in (ROOT / "docs").glob("*.md")}
 TINY = {  # what the example says -> what runs here
-    "wpt/dmc-cartpole-swingup-v0": "Dot-v0",
-    "wpt/dmc-walker-stand-v0": "OtherDot-v0",
-    "episodes=30": "episodes=2",
+    "wpt/metaworld-drawer-close-v0": "Dot-v0",
+    "wpt/metaworld-door-close-v0": "OtherDot-v0",
+    "wpt/dmc-walker-stand-v0": "ThirdDot-v0",
+    'behaviour="scripted"': 'behaviour="noise"',
+    "episodes=20": "episodes=2",
+    'load_preset("metaworld", "demo").wpt': "SETTINGS",
     "steps=1500": "steps=2",
-    '"tiny"': '"debug"',
-    "batch_size=8": "batch_size=2",
-    "batch_length=32": "batch_length=8",
-    "train_ratio=32": "train_ratio=1",
-    "learning_starts=2500": "learning_starts=25",
-    "warmup_steps=2500": "warmup_steps=25",
-    "num_retrieve=30": "num_retrieve=2",
-    "bc_steps=500": "bc_steps=2",
-    "bc_batch_size=64": "bc_batch_size=4",
-    "learn(20_000": "learn(75",
+    "learn(4000": "learn(75",
 }
 
 
@@ -54,12 +48,17 @@ COMMANDS = re.findall(r"^python -m wpt_agents\.zoo (.*)$", LISTED, re.M)
 NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name"))
 
 
+def make_dot(rendering="near", render_mode=None):
+    return toy_env.DotEnv()
+
+
 @pytest.fixture
 def dots():
-    for name in ("Dot-v0", "OtherDot-v0"):
-        gym.register(name, lambda render_mode=None: toy_env.DotEnv())
+    names = [name for name in TINY.values() if name.endswith("-v0")]
+    for name in names:
+        gym.register(name, make_dot)
     yield
-    for name in ("Dot-v0", "OtherDot-v0"):
+    for name in names:
         del gym.registry[name]
 
 
@@ -70,17 +69,17 @@ def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
         assert given in code, given
         code = code.replace(given, tiny)
     monkeypatch.chdir(tmp_path)
-    exec(code, left := {"__name__": "__main__"})
+    settings = {name: value for name, value in SETTINGS.items() if name != "seed"}
+    exec(code, left := {"SETTINGS": settings})
     assert re.search(r"return \d+", capsys.readouterr().out)
-    assert left["model"].updates == (75 - 25) * 1 // (2 * 8)
-    assert len(left["model"].retrieved_ids) == 2 and (tmp_path / "swingup.zip").exists()
+    assert left["model"].updates == (75 - 10) * 0.5 // (2 * 4)  # train_ratio / (B x T)
+    assert len(left["model"].retrieved_ids) == 3 and (tmp_path / "drawer.zip").exists()
 
 
-def test_the_example_is_short_and_holds_valid_keywords():
-    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 22
-    pretrain = re.search(r"WPT\.pretrain\((.*?)\)\n", EXAMPLE, re.S)[1]
-    given = dict.fromkeys(re.findall(r"(\w+)=", pretrain))
-    assert given.keys() <= {*inspect.signature(WPT.pretrain).parameters, *keywords()}
+def test_the_example_is_short_and_its_preset_exists():
+    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 24
+    demo = load_preset("metaworld", "demo")
+    assert demo.env.rendering in EXAMPLE and demo.collect.behaviour in EXAMPLE
 
 
 def test_ones_own_data_are_stored_as_the_readme_says(tmp_path, monkeypatch):
@@ -88,10 +87,6 @@ def test_ones_own_data_are_stored_as_the_readme_says(tmp_path, monkeypatch):
     image, action = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((3, 7), np.float32)
     exec(blocks(section("Your own data"))[0], left := {"image": image, "action": action})
     assert left["dataset"].embodiments == ["arm"]
-
-
-def keywords():
-    return set(inspect.signature(WPT.__init__).parameters)
 
 
 def test_the_table_of_the_paper_names_what_exists():
@@ -119,10 +114,9 @@ def test_every_command_of_the_readme_is_understood(command, monkeypatch, capsys)
 def test_every_task_and_keyword_that_is_named_exists():
     assert set(re.findall(r"wpt/[a-z-]+-v0", README)) <= TASKS.keys()
     assert f"registers {len(TASKS)} ids" in README
-    from wpt_envs import dmc
-
-    made = blocks(section("The tasks"))[0]
-    assert set(re.findall(r"(\w+)=", made)) <= set(inspect.signature(dmc.make).parameters)
+    told = section("The tasks").split("Keywords of `gym.make`")[1].split("\n\n")[0]
+    given = set(re.findall(r"`(\w+)(?:=\w+)?`", told)) - {"exact", "near", "fast"}
+    assert given == inspect.signature(dmc.make).parameters.keys() - {"task", "render_mode"}
 
 
 @pytest.mark.parametrize("text", [README, *PAGES.values()], ids=["README.md", *PAGES])

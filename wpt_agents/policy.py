@@ -125,6 +125,11 @@ class WPTPolicy(BasePolicy):
         :return: action (n, A) in [-1, 1], zero in the padding, and the new state
         """
         n = len(image)
+        if state is not None and len(state[0]) != n:
+            raise ValueError(
+                f"The state is of {len(state[0])} environments, the observation of {n}: pass "
+                "state=None where all episodes begin"
+            )
         deter, stoch, action = (self._tensor(x) for x in state or self.initial_state(n))
         first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
         embed = self.world_model.encoder(self._tensor(image))

@@ -30,7 +30,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
 from torch import Generator, Tensor
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
@@ -168,10 +168,11 @@ class WPT(BaseAlgorithm):
     ) -> None:
         given = {k: v for k, v in locals().items() if k in HYPERPARAMETERS}
         self.hyperparameters = given
-        if size not in SIZES:
-            raise unknown_name("size", size, SIZES)
-        if precision not in ("fp32", "bf16"):
-            raise unknown_name("precision", precision, ("fp32", "bf16"))
+        for name, valid in CHOICES.items():
+            if given[name] not in valid:
+                raise unknown_name(name, given[name], valid)
+        if not 0 <= offline_ratio <= 1:
+            raise ValueError(f"offline_ratio is a share in [0, 1], got {offline_ratio}")
         for name, value in given.items():
             setattr(self, name, value)
         super().__init__(
@@ -276,6 +277,7 @@ class WPT(BaseAlgorithm):
         if self.episodes and wrapped.action_space.shape != self.action_space.shape:
             self.reset_task()
         self.env, self.n_envs = wrapped, wrapped.num_envs
+        self._vec_normalize_env = unwrap_vec_normalize(wrapped)
         self.observation_space, self.action_space = wrapped.observation_space, wrapped.action_space
         self.policy.observation_space = wrapped.observation_space
         self.policy.set_action_space(wrapped.action_space)
@@ -490,14 +492,15 @@ class WPT(BaseAlgorithm):
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.learning_starts:
                 self.credit += self.n_envs
+            finished = rollout.end_step(rewards, dones, last_images(infos, dones))
+            for trajectory in finished:  # before the callback, which may save the replay buffer
+                self.replay_buffer.add(trajectory)
+                self._seen_length = len(trajectory)
+            self.episodes += len(finished)
             callback.update_locals(locals())
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
-            for trajectory in rollout.end_step(rewards, dones, last_images(infos, dones)):
-                self.replay_buffer.add(trajectory)
-                self._seen_length = len(trajectory)
-                self.episodes += 1
-                self._log_episodes(log_interval)
+            self._log_episodes(log_interval, len(finished))
             self._last_obs, self._last_episode_starts = new_obs, dones
             ended = bool(dones.any())
         if go_on:
@@ -694,8 +697,9 @@ class WPT(BaseAlgorithm):
 
     # ------------------------------------------------------------------------------- logging
 
-    def _log_episodes(self, log_interval: int) -> None:
-        if log_interval is None or self.episodes % log_interval:
+    def _log_episodes(self, log_interval: int | None, new: int) -> None:
+        before = self.episodes - new
+        if not log_interval or before // log_interval == self.episodes // log_interval:
             return
         assert self.ep_info_buffer is not None and self.ep_success_buffer is not None
         record = self.logger.record
@@ -738,7 +742,8 @@ class WPT(BaseAlgorithm):
             "counters": {name: getattr(self, name) for name in COUNTERS},
         }
         optimizers = self._get_torch_save_params()[0][1:]
-        tensors = {"policy": self.policy.state_dict()}
+        weights = self.policy.state_dict()
+        tensors = {"policy": {k.replace("_orig_mod.", ""): w for k, w in weights.items()}}
         tensors |= {name: optimizer_tensors(getattr(self, name)) for name in optimizers}
         write_model(path, about, tensors)
 
@@ -808,6 +813,7 @@ class WPT(BaseAlgorithm):
                 raise unknown_name("keyword", name, KEYWORDS)
 
 
+CHOICES = {"size": SIZES, "precision": ("fp32", "bf16"), "free_nats_mode": ("mean", "element")}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}
 COUNTERS = ("num_timesteps", "episodes", "updates", "credit", "cloned", "retrieved_ids")

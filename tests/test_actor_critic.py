@@ -277,7 +277,7 @@ def test_weight_decay_takes_the_same_share_whatever_the_learning_rate(rate):
 def test_the_default_decay_is_a_millionth():
     model = agent()
     for optimizer in (model.model_optimizer, model.actor_optimizer, model.critic_optimizer):
-        [group] = optimizer.param_groups
+        group = optimizer.param_groups[-1]
         assert group["lr"] * group["weight_decay"] == pytest.approx(1e-6)
         assert group["eps"] == 1e-5
 

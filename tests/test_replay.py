@@ -92,7 +92,7 @@ def test_mix_puts_online_first_and_hides_the_rewards_of_retrieved():
     online, retrieved = filled(chain(20, embodiment="a")), filled(chain(20, 1, action_dim=1))
     batch = mix(online, retrieved, 0.25, 16, 8, 2, rng())
     check_chain(batch)
-    assert batch.reward_known[:12].all()
+    assert batch.reward_known[:12, 1:].all()
     assert not batch.reward_known[12:].any()
     assert not batch.reward[12:].any()
     assert batch.action[:12, 1:, 1].any()
@@ -102,13 +102,13 @@ def test_mix_puts_online_first_and_hides_the_rewards_of_retrieved():
 @pytest.mark.parametrize(("ratio", "others"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
 def test_mix_takes_the_share_asked_for(ratio, others):
     batch = mix(filled(chain(9)), filled(chain(9, 1)), ratio, 8, 4, 2, rng())
-    assert (~batch.reward_known.all(1)).sum() == others
+    assert (~batch.reward_known[:, 1:].all(1)).sum() == others
 
 
 @pytest.mark.parametrize("retrieved", [None, ReplayBuffer()])
 def test_mix_without_retrieved_data_is_all_online(retrieved):
     batch = mix(filled(chain(9)), retrieved, 0.5, 8, 4, 2, rng())
-    assert batch.reward_known.all()
+    assert batch.reward_known[:, 1:].all()
 
 
 def test_mix_refuses_a_share_above_one():

@@ -94,7 +94,7 @@ class Actor(Head):
         :param feat: (..., D + S*K)
         :param mask: (A,) bool, True at the embodiment's own entries
         """
-        mean, std = self(feat).chunk(2, -1)
+        mean, std = self(feat).float().chunk(2, -1)
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
 
 

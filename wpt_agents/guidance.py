@@ -28,16 +28,17 @@ def parse_schedule(text: str | float) -> Schedule:
     try:
         if match:
             start, end, duration = (float(group) for group in match.groups())
-            if duration > 0:
+            if duration > 0 and all(0 <= p <= 1 for p in (start, end)):
                 return linear(start, end, duration)
         else:
             constant = float(text)
-            return lambda step: constant
-    except ValueError:
+            if 0 <= constant <= 1:
+                return lambda step: constant
+    except (ValueError, TypeError):
         pass
     raise ValueError(
-        f"Schedule {text!r} is not understood: write a number, or 'linear(start,end,steps)' "
-        "with steps > 0, for example 'linear(1,0,50000)'"
+        f"Schedule {text!r} is not understood: write a probability, or 'linear(start,end,steps)' "
+        "of two probabilities and steps > 0, for example 'linear(1,0,50000)'"
     )
 
 

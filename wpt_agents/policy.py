@@ -88,8 +88,8 @@ class WPTPolicy(BasePolicy):
     def reset_behavior(self) -> None:
         """Draws all that belongs to a task anew: reward head, actor, critic, prior actor."""
         size, device = self.size, self.device
-        fresh = WorldModel(size, self.max_action_dim, zero_init_heads=self.zero_init_heads)
-        self.world_model.reward_head.load_state_dict(fresh.reward_head.state_dict())
+        self.world_model.reset_reward_head()
+        self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
         self.critic = Critic(size, self.zero_init_heads).to(device)
         self.target_critic = Critic(size).to(device).requires_grad_(False)

@@ -141,7 +141,7 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
         "reward": reward,
         "is_first": ~later,
         "is_terminal": (steps == length) & trajectory.terminated,
-        "reward_known": np.full(len(steps), trajectory.reward is not None),
+        "reward_known": (steps > 0) & (trajectory.reward is not None),  # none led to image 0
     }
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import kl_one_hot, two_hot_loss, two_hot_mean
+from wpt_agents.names import unknown_name
 from wpt_agents.networks import Decoder, Encoder, Head, Size, to_uint8, to_unit
 from wpt_agents.rssm import RSSM, Latent
 from wpt_agents.trajectory import Batch
@@ -49,6 +50,8 @@ def world_model_loss(
     error = (reconstruction - image).square().sum((-1, -2, -3)).mean()
     dyn = kl_one_hot(post_logits.detach(), prior_logits)
     rep = kl_one_hot(post_logits, prior_logits.detach())
+    if free_nats_mode not in ("mean", "element"):
+        raise unknown_name("free_nats_mode", free_nats_mode, ("mean", "element"))
     if free_nats_mode == "mean":
         dyn, rep = dyn.mean(), rep.mean()
     kl = dyn.mean().detach()
@@ -82,7 +85,12 @@ class WorldModel(nn.Module):
         self.encoder = Encoder(size.depth)
         self.rssm = RSSM(size, action_dim, self.encoder.embed_dim, unimix)
         self.decoder = Decoder(size)
-        self.reward_head = Head(size, 2, REWARD_BINS, zero_init_heads)
+        self.size, self.zero_init_heads = size, zero_init_heads
+        self.reset_reward_head()
+
+    def reset_reward_head(self) -> None:
+        """Draws the reward head anew: rewards belong to a task, the rest does not."""
+        self.reward_head = Head(self.size, 2, REWARD_BINS, self.zero_init_heads)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
         """All of theta: everything but the reward head."""
@@ -115,6 +123,8 @@ class WorldModel(nn.Module):
         post, _, _ = self.rssm.observe(
             embed, action[:, :context], is_first[:, :context], generator=generator
         )
+        if context >= action.shape[1]:
+            return to_uint8(self.decode(post))
         last = Latent(post.deter[:, -1], post.stoch[:, -1])
         horizon = action.shape[1] - context
         dream, _ = self.rssm.imagine(last, lambda _, t: action[:, context + t], horizon, generator)

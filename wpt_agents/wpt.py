@@ -12,6 +12,7 @@ import hashlib
 import inspect
 import os
 import shutil
+import sys
 import tempfile
 import time
 import warnings
@@ -193,9 +194,10 @@ class WPT(BaseAlgorithm):
         self.replay_buffer = ReplayBuffer()
         self.retrieved: ReplayBuffer | None = None
         self.retrieved_ids: list[int] = []
-        self.cloned, self.episodes, self.updates, self.credit = False, 0, 0, 0.0
+        self.pretrain_steps, self.episodes, self.updates = 0, 0, 0
+        self.cloned, self.credit = False, 0.0
         self._rollout: Rollout | None = None
-        self._seen_length: int | None = None  # of the last episode
+        self._seen_length: int | None = None  # of the longest episode
         self._windows_drawn = 0
         if _init_setup_model:
             self._setup_model()
@@ -230,13 +232,17 @@ class WPT(BaseAlgorithm):
     def _setup_optimizers(self) -> None:
         policy, model_rate = self.policy, float(self.learning_rate)
         rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
-        self.model_optimizer = self._optimizer(policy.world_model, model_rate)
-        self.actor_optimizer = self._optimizer(policy.actor, rate)
-        self.critic_optimizer = self._optimizer(policy.critic, rate)
+        model = policy.world_model
+        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
+        self.model_optimizer = self._optimizer(parts, model_rate)
+        self.actor_optimizer = self._optimizer([list(policy.actor.parameters())], rate)
+        self.critic_optimizer = self._optimizer([list(policy.critic.parameters())], rate)
 
-    def _optimizer(self, module: torch.nn.Module, rate: float) -> Optimizer:
+    def _optimizer(self, parts: list[list[torch.nn.Parameter]], rate: float) -> Optimizer:
+        """Adam over parts that are clipped each by itself."""
         decay = self.weight_decay / rate  # AdamW multiplies it with the rate again
-        return AdamW(module.parameters(), rate, eps=1e-5, weight_decay=decay, fused=True)
+        groups = [{"params": part} for part in parts]
+        return AdamW(groups, rate, eps=1e-5, weight_decay=decay, fused=True)
 
     # ------------------------------------------------------------------ the data and the task
 
@@ -340,7 +346,7 @@ class WPT(BaseAlgorithm):
         callback: Callable[[int, dict[str, float]], Any] | None,
     ) -> None:
         assert self.dataset is not None
-        done = self.updates
+        done = self.pretrain_steps
         bar = tqdm(total=steps, initial=done, desc="pre-train", disable=not progress_bar)
         with bar:
             for step in range(done, steps):
@@ -349,17 +355,16 @@ class WPT(BaseAlgorithm):
                     self.batch_size, self.batch_length, self.max_action_dim, rng
                 ).to(self.device)
                 metrics: dict[str, list[Tensor]] = defaultdict(list)
-                self._update_world_model(batch, metrics)
-                self.updates = step + 1
+                self._update_world_model(batch, metrics, self._generator(PRETRAIN, step))
+                self.pretrain_steps = step + 1
                 if callback is not None:
-                    callback(self.updates, {k: float(v[0]) for k, v in metrics.items()})
+                    callback(self.pretrain_steps, {k: float(v[0]) for k, v in metrics.items()})
                 if step % 20 == 0:
                     loss = float(metrics["train/reconstruction_loss"][0])
                     bar.set_postfix(reconstruction=f"{loss:.1f}")
                 bar.update()
-                if path is not None and (self.updates % EVERY == 0 or self.updates == steps):
+                if path is not None and ((step + 1) % EVERY == 0 or step + 1 == steps):
                     self.save(path)
-        self.updates = 0
 
     # ----------------------------------------------------------------- // Task-Specific Training
 
@@ -495,7 +500,7 @@ class WPT(BaseAlgorithm):
             finished = rollout.end_step(rewards, dones, last_images(infos, dones))
             for trajectory in finished:  # before the callback, which may save the replay buffer
                 self.replay_buffer.add(trajectory)
-                self._seen_length = len(trajectory)
+                self._seen_length = max(self._seen_length or 0, len(trajectory))
             self.episodes += len(finished)
             callback.update_locals(locals())
             go_on = callback.on_step()
@@ -518,7 +523,7 @@ class WPT(BaseAlgorithm):
         """Decides at an episode's start whether, and when, the prior actor drives."""
         length = self._episode_length()
         if self.num_timesteps < self.warmup_steps:
-            return 0, length
+            return 0, sys.maxsize  # all of it, however long it lasts
         probability = self.schedule(self.num_timesteps) if self.cloned else 0.0
         self._windows_drawn += 1
         return draw_window(probability, length, self._stream(WINDOW, self._windows_drawn))
@@ -570,12 +575,11 @@ class WPT(BaseAlgorithm):
         self,
         batch: Any,
         metrics: dict[str, list[Tensor]],
-        generator: Generator | None = None,
+        generator: Generator,
         learn_reward: bool = False,
     ) -> Latent:
         """Eq. (1), and the reward likelihood on states cut off from the world model."""
         model = self.policy.world_model
-        generator = generator or self._generator(PRETRAIN, self.updates)
         with self._autocast():
             loss, post = world_model_update_loss(
                 model,
@@ -642,16 +646,16 @@ class WPT(BaseAlgorithm):
         """
         optimizer.zero_grad()
         loss.backward()
-        weights = [p for group in optimizer.param_groups for p in group["params"]]
-        norm = clip_grad_norm_(weights, self.grad_clip)
-        if not torch.isfinite(norm + loss.detach()):
+        groups = [group["params"] for group in optimizer.param_groups]
+        norms = [clip_grad_norm_(weights, self.grad_clip) for weights in groups]
+        if not torch.isfinite(sum(norms) + loss.detach()):
             raise FloatingPointError(
-                f"The {name} loss is {loss.item()} with gradient norm {norm.item()} at update "
-                f"{self.updates}; the weights are those of the update before: save them, and look "
-                "at the data or lower the learning rate"
+                f"The {name} loss is {loss.item()} at update {self.updates}, its gradient norm "
+                f"{sum(norms).item()}; this step was not taken and the weights are finite: save "
+                "them, and look at the data or lower the learning rate"
             )
         optimizer.step()
-        return norm
+        return norms[0]
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(
@@ -816,7 +820,17 @@ class WPT(BaseAlgorithm):
 CHOICES = {"size": SIZES, "precision": ("fp32", "bf16"), "free_nats_mode": ("mean", "element")}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}
-COUNTERS = ("num_timesteps", "episodes", "updates", "credit", "cloned", "retrieved_ids")
+COUNTERS = (
+    "pretrain_steps",
+    "num_timesteps",
+    "episodes",
+    "updates",
+    "credit",
+    "cloned",
+    "retrieved_ids",
+    "_windows_drawn",
+    "_seen_length",
+)
 
 
 def _torch_seed(rng: np.random.Generator) -> int:

@@ -215,7 +215,7 @@ def poison(monkeypatch, name, after):
 def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network, tmp_path):
     model = agent(ClockEnv())
     poison(monkeypatch, name, after=1)
-    with pytest.raises(FloatingPointError, match=rf"{network} loss is nan .*lower the learning"):
+    with pytest.raises(FloatingPointError, match=rf"{network} loss is nan.*lower the learning"):
         model.learn(100)
     assert finite(model) and model.updates == 1
     monkeypatch.undo()

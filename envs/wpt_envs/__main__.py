@@ -1,6 +1,7 @@
 """python -m wpt_envs {list, montage, likeness, speed}: the tasks, their looks and their cost."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from wpt_envs.tasks import TASKS
@@ -19,9 +20,13 @@ def main() -> None:
     speed = commands.add_parser("speed", help="CPU ms an agent step, beside the usual renderer")
     speed.add_argument("--steps", type=int, default=40)
     arguments = vars(parser.parse_args())
-    {"list": _list, "montage": _montage, "likeness": _likeness, "speed": _speed}[
-        arguments.pop("command")
-    ](**arguments)
+    run: dict[str, Callable[..., None]] = {
+        "list": _list,
+        "montage": _montage,
+        "likeness": _likeness,
+        "speed": _speed,
+    }
+    run[arguments.pop("command")](**arguments)
 
 
 def _list() -> None:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -43,7 +44,7 @@ def views(env: Simulated) -> dict[str, View]:
 
 def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
     """Mean PSNR in dB of `near` and `fast` against `exact`."""
-    env = gym.make(task.id).unwrapped
+    env = _bare(task)
     looks = views(env)
     found: dict[str, list[float]] = {"near": [], "fast": []}
     for _ in visit_states(env, states):
@@ -77,26 +78,37 @@ def speed(task: Task, steps: int = 40) -> dict[str, float]:
         costs[rendering] = step_cost(env, steps)
         env.close()
     env = gym.make(task.id)
-    usual, free = _usual_renderer(env.unwrapped)
-    env.unwrapped.look = lambda size: usual()
+    bare: Any = env.unwrapped
+    usual, free = usual_renderer(bare)
+    bare.look = lambda size: usual()
     costs["usual"] = step_cost(env, steps)
     free()
     env.close()
     return costs
 
 
-def _usual_renderer(env: Simulated) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
-    """dm_control's `Physics.render`, or gymnasium's `MujocoRenderer`."""
+def usual_renderer(env: Any) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
+    """dm_control's `Physics.render` or gymnasium's `MujocoRenderer`: looks, and frees it."""
+    camera = env.view.camera
     if hasattr(env, "dm_env"):
-        physics, camera = env.dm_env.physics, env.view.camera
-        return lambda: physics.render(64, 64, camera_id=camera), lambda: None
+        physics = env.dm_env.physics
+        return lambda: physics.render(64, 64, camera_id=camera), physics.free
     from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
     simulator = env.sawyer if hasattr(env, "sawyer") else env.robot
-    named = {"camera_name": env.view.camera} if isinstance(env.view.camera, str) else {}
-    free = {"default_cam_config": env.view.camera} if not named else {}
-    renderer = MujocoRenderer(simulator.model, simulator.data, width=64, height=64, **named, **free)
-    return lambda: renderer.render("rgb_array")[::-1], renderer.close
+    placed: dict[str, Any] = {"camera_name": camera}
+    if isinstance(camera, dict):
+        placed = {"default_cam_config": camera}
+    renderer = MujocoRenderer(simulator.model, simulator.data, width=64, height=64, **placed)
+    upright = slice(None, None, -1 if hasattr(env, "sawyer") else 1)  # corner4 hangs
+    return lambda: renderer.render("rgb_array")[upright], renderer.close
+
+
+def _bare(task: Task) -> Simulated:
+    """The environment without pixels around it."""
+    env = gym.make(task.id).unwrapped
+    assert isinstance(env, Simulated), env
+    return env
 
 
 def montage(tasks: list[Task], path: Path, size: int = 64, columns: int = 6) -> None:
@@ -105,7 +117,7 @@ def montage(tasks: list[Task], path: Path, size: int = 64, columns: int = 6) -> 
 
     cells = []
     for task in tasks:
-        env = gym.make(task.id).unwrapped
+        env = _bare(task)
         looks = views(env)
         for _ in visit_states(env, 1):
             cells.append(np.concatenate([view.look(size) for view in looks.values()], axis=1))

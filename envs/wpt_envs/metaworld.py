@@ -92,7 +92,7 @@ class MetaWorld(Simulated):
         self.view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)
         self._frame, self._ever = 0, False
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
-        self.observation_space = self.sawyer.sawyer_observation_space
+        self.observation_space = self._bounds = self.sawyer.sawyer_observation_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -120,7 +120,7 @@ class MetaWorld(Simulated):
         return {"success": bool(success), "success_any": self._ever, "is_success": bool(success)}
 
     def _bounded(self, state: np.ndarray) -> np.ndarray:
-        return np.clip(state, self.observation_space.low, self.observation_space.high)
+        return np.clip(state, self._bounds.low, self._bounds.high)
 
 
 def _goal_observable(sawyer: SawyerXYZEnv) -> SawyerXYZEnv:

@@ -89,6 +89,7 @@ class Renderer:
         self._camera = _camera(model, camera)
         self._flip = flip
         self._gl: Any = None
+        self._finalizer: weakref.finalize | None = None
 
     def render(self) -> np.ndarray:
         """The picture now: (size, size, 3) uint8, the top row first."""
@@ -118,9 +119,9 @@ class Renderer:
 
     def close(self) -> None:
         """Frees the GL context; the next picture makes a new one."""
-        if self._gl is not None:
+        if self._finalizer is not None:
             self._finalizer()
-            self._gl = self._mjr = None
+            self._gl = self._mjr = self._finalizer = None
 
     def _open(self) -> None:
         side = self._size * self._quality.supersample

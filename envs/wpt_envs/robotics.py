@@ -1,6 +1,6 @@
 """Gymnasium-Robotics: Fetch, the Shadow hand and Adroit, an extra suite of further embodiments."""
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -97,7 +97,7 @@ class Robotics(Simulated):
         render_mode: str | None = "rgb_array",
     ) -> None:
         gym.register_envs(gymnasium_robotics)
-        self.robot = gym.make(_IDS[task.name], disable_env_checker=True).unwrapped
+        self.robot = cast(Any, gym.make(_IDS[task.name], disable_env_checker=True).unwrapped)
         super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)
         usual = self.robot.mujoco_renderer.default_cam_config
         self.view = View(

@@ -21,6 +21,7 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
         :param action: (A,)
         """
         action, box = np.asarray(action, np.float32), self.action_space
+        assert isinstance(box, spaces.Box), box
         if action.shape != box.shape:
             raise ValueError(f"The action has shape {action.shape}; {box.shape} is wanted")
         if not np.isfinite(action).all():

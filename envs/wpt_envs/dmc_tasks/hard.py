@@ -2,9 +2,10 @@
 
 import numpy as np
 from dm_control.mujoco import Physics
+from dm_control.suite.base import Task
 
 
-class HardReward:
+class HardReward(Task):
     """Put before a task's class: r' = (r if r >= threshold else 0) - 0.1 ||a||.
 
     The action is the agent's own, before actuators clip it, at every control step.

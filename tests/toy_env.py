@@ -1,6 +1,6 @@
 """A dot to be pushed to a target: pixels in, two actions out, and an optimum that is known."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +13,7 @@ LENGTH = 25
 class DotEnv(gym.Env):
     """Each axis moves by SPEED times its action; the reward is 1 at the target, 0 at distance 2."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, render_mode: str | None = "rgb_array", size: int = 64, actions: int = 2):
         self.render_mode, self.size = render_mode, size
@@ -36,7 +36,8 @@ class DotEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         image = np.full((self.size, self.size, 3), 30, np.uint8)
-        for place, half, colour in ((self.target, 9, (40, 160, 60)), (self.dot, 5, (250, 250, 250))):
+        disc, dot = (self.target, 9, (40, 160, 60)), (self.dot, 5, (250, 250, 250))
+        for place, half, colour in (disc, dot):
             row, column = ((place + 1) / 2 * (self.size - 1)).round().astype(int)
             rows = slice(max(row - half, 0), row + half + 1)
             image[rows, max(column - half, 0) : column + half + 1] = colour

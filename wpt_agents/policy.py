@@ -213,6 +213,19 @@ class WPTPolicy(BasePolicy):
         frames = self.world_model.open_loop(batch.to(self.device), context)
         return frames[0].cpu().numpy()
 
+    @torch.no_grad()
+    def reward_error(self, trajectory: Trajectory, images: int = 256) -> float:
+        """Mean absolute error of the predicted rewards of an episode, its first `images` at most.
+
+        On an episode that is not yet in the replay buffer, an error on held-out steps.
+        """
+        stop = min(len(trajectory) + 1, images)
+        batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)]).to(self.device)
+        generator = Generator(self.device).manual_seed(0)
+        post, _, _ = self.world_model.observe(batch, generator)
+        error = (self.world_model.reward(post.feat) - batch.reward).abs()
+        return error[batch.reward_known].mean().item()
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),

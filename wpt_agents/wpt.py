@@ -499,6 +499,9 @@ class WPT(BaseAlgorithm):
                 self.credit += self.n_envs
             finished = rollout.end_step(rewards, dones, last_images(infos, dones))
             for trajectory in finished:  # before the callback, which may save the replay buffer
+                if self.updates:
+                    error = self.policy.reward_error(trajectory)
+                    self.logger.record_mean("train/heldout_reward_error", error)
                 self.replay_buffer.add(trajectory)
                 self._seen_length = max(self._seen_length or 0, len(trajectory))
             self.episodes += len(finished)

@@ -287,7 +287,7 @@ def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
     # from 1 to a range of 90: 1 + .01 * 89 = 1.89, then 1.89 + .01 * 88.11 = 2.7711;
     # to a range of 0, of 2.7711: 2.7711 * .99 ** 200 = 0.37, which counts as 1
     for width, times, scale in ((90.0, 1, 1.89), (90.0, 1, 2.7711), (0.0, 200, 1.0)):
-        monkeypatch.setattr("wpt_agents.wpt.return_range", lambda _, w=width: torch.tensor(w))
+        monkeypatch.setattr("wpt_agents.updates.return_range", lambda _, w=width: torch.tensor(w))
         model.policy.return_scale.mul_(0.99 ** (times - 1))
         model.update(metrics)
         assert metrics["train/return_scale"][-1].item() == pytest.approx(scale)

@@ -19,7 +19,6 @@ import warnings
 import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
@@ -33,38 +32,28 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
 from torch import Generator, Tensor
-from torch.nn.utils import clip_grad_norm_
-from torch.optim import AdamW, Optimizer
+from torch.optim import AdamW
 from tqdm.auto import tqdm
 
-from wpt_agents.actor_critic import (
-    actor_loss,
-    critic_loss,
-    ema_update,
-    lambda_return,
-    return_range,
-)
 from wpt_agents.behavior_cloning import FRAMES, bc_loss, random_shift
 from wpt_agents.checks import check_dataset, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.model_file import load_optimizer, optimizer_tensors, read_model, write_model
 from wpt_agents.names import unknown_name
-from wpt_agents.networks import SIZES, frozen
+from wpt_agents.networks import SIZES
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, State, WPTPolicy, to_images
-from wpt_agents.replay import ReplayBuffer, mix
+from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide
-from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.world_model import reward_loss, world_model_update_loss
+from wpt_agents.updates import ACT, CLONE, PRETRAIN, WARMUP, WINDOW, Updates, torch_seed
 
 Data = str | os.PathLike[str] | TrajectoryDataset | Iterable[Trajectory]
-PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT = range(6)  # purposes of random streams
 EVERY = 1000  # pre-training steps between checkpoints
 
 
-class WPT(BaseAlgorithm):
+class WPT(Updates, BaseAlgorithm):
     """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
 
     Example::
@@ -228,21 +217,6 @@ class WPT(BaseAlgorithm):
         if seed is not None:
             self.seed = self.stream_seed = seed
         super().set_random_seed(seed)
-
-    def _setup_optimizers(self) -> None:
-        policy, model_rate = self.policy, float(self.learning_rate)
-        rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
-        model = policy.world_model
-        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
-        self.model_optimizer = self._optimizer(parts, model_rate)
-        self.actor_optimizer = self._optimizer([list(policy.actor.parameters())], rate)
-        self.critic_optimizer = self._optimizer([list(policy.critic.parameters())], rate)
-
-    def _optimizer(self, parts: list[list[torch.nn.Parameter]], rate: float) -> Optimizer:
-        """Adam over parts that are clipped each by itself."""
-        decay = self.weight_decay / rate  # AdamW multiplies it with the rate again
-        groups = [{"params": part} for part in parts]
-        return AdamW(groups, rate, eps=1e-5, weight_decay=decay, fused=True)
 
     # ------------------------------------------------------------------ the data and the task
 
@@ -519,7 +493,7 @@ class WPT(BaseAlgorithm):
         if self._rollout is None or self._last_episode_starts.all():
             self._rollout = Rollout(self.policy, self.n_envs, self._draw_window, self.embodiment)
             generator = self.policy.generator
-            generator.manual_seed(_torch_seed(self._stream(ACT, self.episodes)))
+            generator.manual_seed(torch_seed(self._stream(ACT, self.episodes)))
         return self._rollout
 
     def _draw_window(self) -> tuple[int, int]:
@@ -557,123 +531,6 @@ class WPT(BaseAlgorithm):
             self.update(metrics)
         for key, values in metrics.items():
             self.logger.record_mean(key, torch.stack(values).mean().item())
-
-    def update(self, metrics: dict[str, list[Tensor]]) -> None:
-        """One gradient step of every network on a mixed batch; appends to `metrics`."""
-        generator = self._generator(UPDATE, self.updates)
-        batch = mix(
-            self.replay_buffer,
-            self.retrieved,
-            self.offline_ratio,
-            self.batch_size,
-            self.batch_length,
-            self.max_action_dim,
-            self._stream(UPDATE, self.updates),
-        ).to(self.device)
-        post = self._update_world_model(batch, metrics, generator, learn_reward=True)
-        self._update_behavior(post.flatten_time(), metrics, generator)
-        self.updates += 1
-
-    def _update_world_model(
-        self,
-        batch: Any,
-        metrics: dict[str, list[Tensor]],
-        generator: Generator,
-        learn_reward: bool = False,
-    ) -> Latent:
-        """Eq. (1), and the reward likelihood on states cut off from the world model."""
-        model = self.policy.world_model
-        with self._autocast():
-            loss, post = world_model_update_loss(
-                model,
-                batch,
-                generator,
-                dyn_scale=self.dyn_scale,
-                rep_scale=self.rep_scale,
-                free_nats=self.free_nats,
-                free_nats_mode=self.free_nats_mode,
-            )
-            total = loss.total
-            if learn_reward:
-                logits = model.reward_head(post.feat.detach())
-                reward = reward_loss(logits, batch.reward, batch.reward_known)
-                total = total + reward
-                metrics["train/reward_loss"].append(reward.detach())
-        norm = self._descend(self.model_optimizer, total, "world model")
-        metrics["train/reconstruction_loss"].append(loss.reconstruction.detach())
-        metrics["train/kl"].append(loss.kl)
-        metrics["train/world_model_grad_norm"].append(norm)
-        return post.detach()
-
-    def _update_behavior(
-        self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
-    ) -> None:
-        """Actor and critic on imagined trajectories, Eq. (2) to (4)."""
-        policy, model = self.policy, self.policy.world_model
-        with self._autocast():
-            dream = policy.dream(start, self.imagine_horizon, generator)
-            feat = dream.states.feat
-            with frozen(model):
-                reward = model.reward(feat[:, :-1])
-            value = policy.target_critic.value(feat)
-            returns = lambda_return(reward, value, self.gamma, self.lam)
-            spread = scale = torch.ones_like(policy.return_scale)
-            if self.return_norm:
-                spread = policy.return_scale.lerp(return_range(returns), 0.01)
-                scale = spread.clamp_min(1.0)
-            loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
-        actor_norm = self._descend(self.actor_optimizer, loss, "actor")
-        policy.return_scale.copy_(spread)  # now that it is known to be finite
-        with self._autocast():
-            logits = policy.critic(feat[:, :-1].detach())
-            value_loss = critic_loss(logits, returns, self.gamma)
-        critic_norm = self._descend(self.critic_optimizer, value_loss, "critic")
-        ema_update(policy.target_critic, policy.critic, self.target_fraction)
-        for key, tensor in {
-            "actor_loss": loss,
-            "critic_loss": value_loss,
-            "value": value.mean(),
-            "imagined_reward": reward.mean(),
-            "entropy": dream.entropy.mean(),
-            "saturated_actions": dream.saturated,
-            "return_scale": scale,
-            "actor_grad_norm": actor_norm,
-            "critic_grad_norm": critic_norm,
-        }.items():
-            metrics[f"train/{key}"].append(tensor.detach())
-
-    def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
-        """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
-
-        :return: the gradient's norm before clipping
-        """
-        optimizer.zero_grad()
-        loss.backward()
-        groups = [group["params"] for group in optimizer.param_groups]
-        norms = [clip_grad_norm_(weights, self.grad_clip) for weights in groups]
-        if not torch.isfinite(sum(norms) + loss.detach()):
-            raise FloatingPointError(
-                f"The {name} loss is {loss.item()} at update {self.updates}, its gradient norm "
-                f"{sum(norms).item()}; this step was not taken and the weights are finite: save "
-                "them, and look at the data or lower the learning rate"
-            )
-        optimizer.step()
-        return norms[0]
-
-    def _autocast(self) -> AbstractContextManager[None]:
-        return torch.autocast(
-            self.device.type, torch.bfloat16, enabled=self.precision == "bf16", cache_enabled=True
-        )
-
-    # ---------------------------------------------------------------------------- randomness
-
-    def _stream(self, purpose: int, counter: int) -> np.random.Generator:
-        """Random numbers that depend on the seed, what they are for, and a counter; no state."""
-        return np.random.default_rng([self.stream_seed, purpose, counter])
-
-    def _generator(self, purpose: int, counter: int) -> Generator:
-        seed = _torch_seed(self._stream(purpose, counter))
-        return Generator(self.device).manual_seed(seed)
 
     # ------------------------------------------------------------------------------- acting
 
@@ -834,7 +691,3 @@ COUNTERS = (
     "_windows_drawn",
     "_seen_length",
 )
-
-
-def _torch_seed(rng: np.random.Generator) -> int:
-    return int(rng.integers(2**31))

@@ -1,0 +1,194 @@
+"""// Update Models of Algorithm 1: one gradient step of each network, and what it draws on.
+
+`WPT` inherits `Updates`, so that `wpt.py` holds the algorithm and this module its gradient steps.
+"""
+
+from contextlib import AbstractContextManager
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW, Optimizer
+
+from wpt_agents.actor_critic import (
+    actor_loss,
+    critic_loss,
+    ema_update,
+    lambda_return,
+    return_range,
+)
+from wpt_agents.networks import SIZES, frozen
+from wpt_agents.policy import WPTPolicy
+from wpt_agents.replay import ReplayBuffer, mix
+from wpt_agents.rssm import Latent
+from wpt_agents.trajectory import Batch
+from wpt_agents.world_model import reward_loss, world_model_update_loss
+
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT = range(6)  # purposes of random streams
+
+
+class Updates:
+    """The optimisers of a policy's networks and the steps they take, by the keywords of WPT."""
+
+    policy: WPTPolicy
+    device: torch.device
+    replay_buffer: ReplayBuffer
+    retrieved: ReplayBuffer | None
+    learning_rate: float
+    stream_seed: int
+    updates: int
+    size: str
+    actor_critic_learning_rate: float | None
+    max_action_dim: int
+    batch_size: int
+    batch_length: int
+    offline_ratio: float
+    weight_decay: float
+    grad_clip: float
+    dyn_scale: float
+    rep_scale: float
+    free_nats: float
+    free_nats_mode: str
+    imagine_horizon: int
+    gamma: float
+    lam: float
+    ent_coef: float
+    target_fraction: float
+    return_norm: bool
+    precision: str
+
+    def _setup_optimizers(self) -> None:
+        policy, model_rate = self.policy, float(self.learning_rate)
+        rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
+        model = policy.world_model
+        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
+        self.model_optimizer = self._optimizer(parts, model_rate)
+        self.actor_optimizer = self._optimizer([list(policy.actor.parameters())], rate)
+        self.critic_optimizer = self._optimizer([list(policy.critic.parameters())], rate)
+
+    def _optimizer(self, parts: list[list[torch.nn.Parameter]], rate: float) -> Optimizer:
+        """Adam over parts that are clipped each by itself."""
+        decay = self.weight_decay / rate  # AdamW multiplies it with the rate again
+        groups = [{"params": part} for part in parts]
+        return AdamW(groups, rate, eps=1e-5, weight_decay=decay, fused=True)
+
+    def update(self, metrics: dict[str, list[Tensor]]) -> None:
+        """One gradient step of every network on a mixed batch; appends to `metrics`."""
+        generator = self._generator(UPDATE, self.updates)
+        batch = mix(
+            self.replay_buffer,
+            self.retrieved,
+            self.offline_ratio,
+            self.batch_size,
+            self.batch_length,
+            self.max_action_dim,
+            self._stream(UPDATE, self.updates),
+        ).to(self.device)
+        post = self._update_world_model(batch, metrics, generator, learn_reward=True)
+        self._update_behavior(post.flatten_time(), metrics, generator)
+        self.updates += 1
+
+    def _update_world_model(
+        self,
+        batch: Batch,
+        metrics: dict[str, list[Tensor]],
+        generator: Generator,
+        learn_reward: bool = False,
+    ) -> Latent:
+        """Eq. (1), and the reward likelihood on states cut off from the world model."""
+        model = self.policy.world_model
+        with self._autocast():
+            loss, post = world_model_update_loss(
+                model,
+                batch,
+                generator,
+                dyn_scale=self.dyn_scale,
+                rep_scale=self.rep_scale,
+                free_nats=self.free_nats,
+                free_nats_mode=self.free_nats_mode,
+            )
+            total = loss.total
+            if learn_reward:
+                logits = model.reward_head(post.feat.detach())
+                reward = reward_loss(logits, batch.reward, batch.reward_known)
+                total = total + reward
+                metrics["train/reward_loss"].append(reward.detach())
+        norm = self._descend(self.model_optimizer, total, "world model")
+        metrics["train/reconstruction_loss"].append(loss.reconstruction.detach())
+        metrics["train/kl"].append(loss.kl)
+        metrics["train/world_model_grad_norm"].append(norm)
+        return post.detach()
+
+    def _update_behavior(
+        self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
+    ) -> None:
+        """Actor and critic on imagined trajectories, Eq. (2) to (4)."""
+        policy, model = self.policy, self.policy.world_model
+        with self._autocast():
+            dream = policy.dream(start, self.imagine_horizon, generator)
+            feat = dream.states.feat
+            with frozen(model):
+                reward = model.reward(feat[:, :-1])
+            value = policy.target_critic.value(feat)
+            returns = lambda_return(reward, value, self.gamma, self.lam)
+            spread = scale = torch.ones_like(policy.return_scale)
+            if self.return_norm:
+                spread = policy.return_scale.lerp(return_range(returns), 0.01)
+                scale = spread.clamp_min(1.0)
+            loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
+        actor_norm = self._descend(self.actor_optimizer, loss, "actor")
+        policy.return_scale.copy_(spread)  # now that it is known to be finite
+        with self._autocast():
+            logits = policy.critic(feat[:, :-1].detach())
+            value_loss = critic_loss(logits, returns, self.gamma)
+        critic_norm = self._descend(self.critic_optimizer, value_loss, "critic")
+        ema_update(policy.target_critic, policy.critic, self.target_fraction)
+        for key, tensor in {
+            "actor_loss": loss,
+            "critic_loss": value_loss,
+            "value": value.mean(),
+            "imagined_reward": reward.mean(),
+            "entropy": dream.entropy.mean(),
+            "saturated_actions": dream.saturated,
+            "return_scale": scale,
+            "actor_grad_norm": actor_norm,
+            "critic_grad_norm": critic_norm,
+        }.items():
+            metrics[f"train/{key}"].append(tensor.detach())
+
+    def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
+
+        :return: the gradient's norm before clipping
+        """
+        optimizer.zero_grad()
+        loss.backward()
+        groups = [group["params"] for group in optimizer.param_groups]
+        norms = [clip_grad_norm_(weights, self.grad_clip) for weights in groups]
+        if not torch.isfinite(sum(norms) + loss.detach()):
+            raise FloatingPointError(
+                f"The {name} loss is {loss.item()} at update {self.updates}, its gradient norm "
+                f"{sum(norms).item()}; this step was not taken and the weights are finite: save "
+                "them, and look at the data or lower the learning rate"
+            )
+        optimizer.step()
+        return norms[0]
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        return torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self.precision == "bf16", cache_enabled=True
+        )
+
+    def _stream(self, purpose: int, counter: int) -> np.random.Generator:
+        """Random numbers that depend on the seed, what they are for, and a counter; no state."""
+        return np.random.default_rng([self.stream_seed, purpose, counter])
+
+    def _generator(self, purpose: int, counter: int) -> Generator:
+        seed = torch_seed(self._stream(purpose, counter))
+        return Generator(self.device).manual_seed(seed)
+
+
+def torch_seed(rng: np.random.Generator) -> int:
+    """A seed for torch's generators."""
+    return int(rng.integers(2**31))

@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import os
 
 import gymnasium as gym
 import mujoco
@@ -160,7 +161,8 @@ def unset(monkeypatch):
 
 def test_without_egl_osmesa_is_chosen(unset):
     unset.setattr(headless, "_osmesa_works", lambda: True)
-    assert headless.choose() == "osmesa"
+    headless.choose()
+    assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
 def test_without_any_off_screen_gl_the_error_says_what_to_install(unset):
@@ -169,10 +171,19 @@ def test_without_any_off_screen_gl_the_error_says_what_to_install(unset):
         headless.choose()
 
 
-def test_what_the_user_chose_is_kept(monkeypatch):
+def test_a_users_choice_is_kept(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     headless.prefer_egl()
-    assert headless.choose() == "glfw"
+    headless.choose()
+    assert os.environ["MUJOCO_GL"] == "glfw"
+
+
+def test_a_users_choice_which_does_not_work_is_an_error_not_an_abort(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr(headless, "_preferred_here", False)
+    monkeypatch.setattr(headless, "_osmesa_works", lambda: False)
+    with pytest.raises(RuntimeError, match="MUJOCO_GL=osmesa does not work here"):
+        headless.choose()
 
 
 def test_every_rendering_is_a_keyword_of_every_suite():

@@ -10,7 +10,7 @@ import os
 import sys
 
 _INSTALL = (
-    "No off-screen OpenGL: neither EGL nor OSMesa works on this machine. Install one, e.g. "
+    "Drawing off screen needs EGL or OSMesa. If neither works, install one: "
     "`apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri` or `apt-get install libosmesa6`."
 )
 _PLATFORM_DEVICE = 0x313F  # EGL_PLATFORM_DEVICE_EXT
@@ -52,20 +52,22 @@ def _osmesa_works() -> bool:
 def prefer_egl() -> None:
     """Sets `MUJOCO_GL` to `egl` where the user left it unset; costs nothing."""
     global _preferred_here
+    # Mesa's software rasteriser reads this when dm_control or MuJoCo first open it. At 64 x 64
+    # its threads cost more than they bring, and a forked process would wait for them for ever.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     if "MUJOCO_GL" not in os.environ and sys.platform == "linux":
         os.environ["MUJOCO_GL"], _preferred_here = "egl", True
 
 
-def choose() -> str:
-    """Tries out what `prefer_egl` set, falls back on OSMesa, and says what it is now."""
+def choose() -> None:
+    """Tries out what is asked for; what `prefer_egl` set gives way to OSMesa if need be."""
     global _preferred_here
-    # Mesa's software rasteriser reads this when first opened, which is below. At 64 x 64 its
-    # threads cost more than they bring, and a forked process would wait for them for ever.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    if _preferred_here:
-        _preferred_here = False
-        if not _egl_works():
-            if not _osmesa_works():
-                raise RuntimeError(_INSTALL)
-            os.environ["MUJOCO_GL"] = "osmesa"
-    return os.environ.get("MUJOCO_GL", "")
+    asked = os.environ.get("MUJOCO_GL", "")
+    works = {"egl": _egl_works, "osmesa": _osmesa_works}.get(asked)
+    if works is None or works():
+        return
+    if not _preferred_here:
+        raise RuntimeError(f"MUJOCO_GL={asked} does not work here; unset it. {_INSTALL}")
+    if not _osmesa_works():
+        raise RuntimeError(_INSTALL)
+    os.environ["MUJOCO_GL"], _preferred_here = "osmesa", False

@@ -16,7 +16,7 @@ import numpy as np
 from wpt_envs.headless import choose
 from wpt_envs.meshes import thin_meshes
 
-choose()  # before MuJoCo reads it
+choose()  # before MuJoCo reads MUJOCO_GL
 import mujoco  # noqa: E402
 
 _FLAGS = {
@@ -225,7 +225,7 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _egl() -> ModuleType | None:
-    if choose() != "egl":
+    if os.environ.get("MUJOCO_GL") != "egl":
         return None
     import mujoco.egl
 

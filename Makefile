@@ -10,9 +10,8 @@ INSTALLED := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 # torch comes before everything else, and alone, so that pip takes the build that is offered for this
-# machine (a local CPU wheel, say) and the rest only finds it installed. Without a GPU and without a
-# local wheel, the small CPU build comes from PyTorch's own index:
-#   make demo TORCH_ARGS="--index-url https://download.pytorch.org/whl/cpu"
+# machine (a local CPU wheel, say) and the rest only finds it installed. TORCH_ARGS hands pip further
+# options, such as the index of PyTorch's small CPU builds.
 TORCH ?= torch==2.13.0
 TORCH_RANGE := torch>=2.8,<2.14
 TORCH_ARGS ?=

@@ -132,7 +132,7 @@ def _work(job: Run) -> dict[str, Any]:
             _learn(job, model)
         model.save(job.folder / "model.zip")
     with clock("evaluate"):
-        scores = _evaluate(job, model)
+        model, scores = _evaluate(job, model)
     with clock("pictures"):
         _draw(job, model, scores)
     result = _result(job, scores, clock.seconds)
@@ -178,28 +178,38 @@ def _evaluation(job: Run) -> Iterator[list[BaseCallback]]:
     if not given.every:
         yield []
         return
-    with closing(make_vec_env(job.task.id, job.shared.env, job.evaluation_seed)) as venv:
+    seed = job.evaluation_seed + 10_000  # apart from training and from the scores at the end
+    with closing(make_vec_env(job.task.id, job.shared.env, seed)) as venv:
         callback = EvalCallback(
             venv,
             n_eval_episodes=given.during_episodes,
             eval_freq=max(1, given.every // job.preset.env.action_repeat),
             log_path=str(job.folder),
+            best_model_save_path=str(job.folder) if given.keep_best else None,
             deterministic=True,
             verbose=0,
         )
         yield [callback]
 
 
-def _evaluate(job: Run, model: WPT) -> dict[str, Score]:
-    """Stage 5: the returns of doing nothing, random actions, the prior actor and WPT."""
+def _evaluate(job: Run, model: WPT) -> tuple[WPT, dict[str, Score]]:
+    """Stage 5: the returns of doing nothing, random actions, the prior actor and WPT.
+
+    :return: the model that counts, the best in between or the last, and all scores
+    """
     episodes, seed = job.preset.evaluate.episodes, job.evaluation_seed
     say("evaluate", f"{episodes} episodes of each policy, from the same initial states")
     scores = {name: job.shared.baseline(name, job.task, seed) for name in BASELINES}
     policies = {"prior actor": model.prior, "WPT": model}
+    best = job.folder / "best_model.zip"
+    if best.exists():
+        policies |= {"WPT, last": model, "WPT": WPT.load(best, device=job.device)}
     for name, policy in policies.items():
         if policy is not None:
             scores[name] = evaluate(policy, job.task.id, job.shared.env, episodes, seed, name)
-    return scores
+    counts = policies["WPT"]
+    assert isinstance(counts, WPT)
+    return counts, scores
 
 
 def _draw(job: Run, model: WPT, scores: Mapping[str, Score]) -> None:

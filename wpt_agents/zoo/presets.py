@@ -82,11 +82,16 @@ class LearnSettings(Section):
 
 @dataclass(frozen=True)
 class EvaluateSettings(Section):
-    """Evaluation: `episodes` at the end, and `during_episodes` every `every` frames (0: never)."""
+    """Evaluation: `episodes` at the end, and `during_episodes` every `every` frames (0: never).
+
+    With `keep_best` the policy that did best in between is scored at the end, on other episodes,
+    and the last one beside it.
+    """
 
     episodes: int = 10
     every: int = 0
     during_episodes: int = 5
+    keep_best: bool = False
 
 
 @dataclass(frozen=True)

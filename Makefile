@@ -1,6 +1,7 @@
 # Two commands on a bare machine (Python 3.11+, git, a shell):
 #   make demo    installs, then runs the whole method on one task in minutes
 #   make test    installs, then runs the tests
+#   make learn   the test that learns from scratch, three seeds of some minutes each
 # Both make .venv when it is not there. Nothing outside this folder is written.
 
 PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13,$(if $(shell $(p) -c "import sys; print(sys.version_info >= (3, 11) or '')" 2>/dev/null),$(p))))
@@ -18,7 +19,7 @@ TORCH_ARGS ?=
 DEMO_ARGS ?=
 TEST_ARGS ?=
 
-.PHONY: help demo test lint install rendering clean
+.PHONY: help demo test learn lint install rendering clean
 
 help:
 	@sed -n "s/^#   \(make [a-z]*  \)/  \1/p" Makefile
@@ -55,6 +56,9 @@ demo: rendering
 test: rendering
 	@echo "[test] pytest $(TEST_ARGS)"
 	@$(BIN)/python -m pytest $(TEST_ARGS)
+
+learn: $(INSTALLED)
+	@$(BIN)/python -m pytest tests/test_learning.py --seeds 3 -v --durations 3
 
 lint: $(INSTALLED)
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -1,10 +1,16 @@
 """Options of the test run."""
 
+import pytest
+
 
 def pytest_addoption(parser):
-    parser.addoption("--seeds", type=int, default=1, help="seeds of each learning test")
+    parser.addoption("--seeds", type=int, default=0, help="seeds of the minutes-long learning test")
 
 
 def pytest_generate_tests(metafunc):
     if "learning_seed" in metafunc.fixturenames:
-        metafunc.parametrize("learning_seed", range(metafunc.config.getoption("--seeds")))
+        seeds = metafunc.config.getoption("--seeds")
+        asked = pytest.mark.skip(reason="takes minutes a seed: ask for it with --seeds 3")
+        metafunc.parametrize(
+            "learning_seed", range(seeds) if seeds else [pytest.param(0, marks=asked)]
+        )

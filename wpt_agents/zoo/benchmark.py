@@ -23,7 +23,6 @@ import torch
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -216,8 +215,9 @@ def _draw(job: Run, model: WPT, scores: Mapping[str, Score]) -> None:
     """Stage 6: the learning curve, a video and a strip of predictions."""
     say("pictures", "learning_curve.png, policy.mp4, predictions.png")
     title = f"{short_name(job.task)}, {job.method}, preset {job.preset_name}, seed {job.seed}"
-    training, repeat = load_results(str(job.folder)), job.preset.env.action_repeat
-    frames, returns = training["l"].cumsum().to_numpy() * repeat, training["r"].to_numpy()
+    monitor = np.genfromtxt(job.folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
+    training, repeat = np.atleast_1d(monitor), job.preset.env.action_repeat
+    frames, returns = training["l"].cumsum() * repeat, training["r"]
     path, between = job.folder / "evaluations.npz", None
     if path.exists():
         with np.load(path) as held:

@@ -46,7 +46,7 @@ $(INSTALLED): pyproject.toml
 
 # The simulators draw without a display, by EGL or OSMesa. Which one is chosen, or what to install.
 rendering: $(INSTALLED)
-	@$(BIN)/python -c "from wpt_envs import headless; print('[rendering] off-screen by', headless.choose() or 'the window system')" \
+	@$(BIN)/python -c "import os; from wpt_envs import headless; headless.choose(); print('[rendering] by', os.environ.get('MUJOCO_GL', 'the window system'))" \
 	  2> $(VENV)/rendering.log || { echo "[rendering] $$(tail -n 1 $(VENV)/rendering.log)"; exit 1; }
 
 demo: rendering

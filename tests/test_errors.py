@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents import wpt
+from wpt_agents import updates, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.wpt import WPT
@@ -193,14 +193,14 @@ def test_observations_that_are_not_bytes_stop_and_nothing_of_them_is_stored():
 
 def poison(monkeypatch, name, after):
     """From call `after` on, the loss of this name is NaN."""
-    function, calls = getattr(wpt, name), []
+    function, calls = getattr(updates, name), []
 
     def spoilt(*args, **kwargs):
         calls.append(1)
         out = function(*args, **kwargs)
         return out * (torch.nan if len(calls) > after else 1.0)
 
-    monkeypatch.setattr(wpt, name, spoilt)
+    monkeypatch.setattr(updates, name, spoilt)
 
 
 @pytest.mark.parametrize(
@@ -240,13 +240,13 @@ def test_pretraining_that_diverges_keeps_its_last_checkpoint(monkeypatch, tmp_pa
             raise_at_next_update()
 
     def raise_at_next_update():
-        loss = wpt.world_model_update_loss
+        loss = updates.world_model_update_loss
 
         def spoilt(*args, **kwargs):
             parts, post = loss(*args, **kwargs)
             return parts._replace(total=parts.total * torch.nan), post
 
-        monkeypatch.setattr(wpt, "world_model_update_loss", spoilt)
+        monkeypatch.setattr(updates, "world_model_update_loss", spoilt)
 
     with pytest.raises(FloatingPointError, match="world model loss is nan"):
         pretrained([recorded()], steps=6, run_dir=tmp_path, callback=damage)

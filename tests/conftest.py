@@ -1,6 +1,9 @@
 """Options of the test run."""
 
 import pytest
+import torch
+
+torch.set_num_threads(1)  # the networks here are so small that threads would only wait
 
 
 def pytest_addoption(parser):

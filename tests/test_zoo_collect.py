@@ -8,9 +8,9 @@ from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.zoo import collect as module
 from wpt_agents.zoo.collect import COLOURS, collect, coloured_noise, noise_actions, record
 
-gym.register("Dot-v0", entry_point="toy_env:DotEnv")
+gym.register("PlainDot-v0", entry_point="toy_env:DotEnv")
 gym.register("WideDot-v0", entry_point="toy_env:DotEnv", kwargs={"actions": 3})
-DOT, WIDE = f"{__name__}:Dot-v0", f"{__name__}:WideDot-v0"  # importable from a fresh process
+DOT, WIDE = f"{__name__}:PlainDot-v0", f"{__name__}:WideDot-v0"  # importable from a fresh process
 
 
 def same(ours, theirs):

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 
 from wpt_agents.actor_critic import Actor, Critic
 from wpt_agents.behavior_cloning import FRAMES, PriorActor
@@ -277,8 +277,3 @@ def prior_action(policy: WPTPolicy, frames: np.ndarray) -> np.ndarray:
     """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
     images = torch.from_numpy(frames).to(policy.device)
     return policy.prior_actor.act(images, policy.action_mask).cpu().numpy()
-
-
-def parameters(*modules: nn.Module) -> list[nn.Parameter]:
-    """The trainable parameters of several modules."""
-    return [p for m in modules for p in m.parameters() if p.requires_grad]

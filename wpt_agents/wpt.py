@@ -409,10 +409,10 @@ class WPT(Updates, BaseAlgorithm):
         assert self.dataset is not None
         encoder_id = self.encoder_id()
         path = Path(self.dataset.path) / f"retrieval-{encoder_id[:12]}.index"
-        whole = len(self.dataset) == len(TrajectoryDataset.open(path.parent))  # not a subset
+        whole = not self.dataset.is_subset
         if whole and path.exists():
             retriever = Retriever.load(path, encoder_id)
-            if len(retriever) == len(self.dataset):
+            if retriever.dataset_id == self.dataset.fingerprint:
                 return retriever
         retriever = Retriever.build(self.dataset, self.embed, encoder_id, progress_bar)
         try:

@@ -131,7 +131,8 @@ def test_batch_k_depends_on_seed_rank_and_k_alone(tmp_path):
         batches.close()
         return found
 
-    assert starts(0, 3)[:2] == starts(0, 0)[3:]
+    drawn = [dataset.sample(4, 9, 2, rng([1, 0, k])).image[:, 0, 0, 0, 0].tolist() for k in (3, 4)]
+    assert starts(0, 3)[:2] == starts(0, 0)[3:] == drawn
     assert starts(0, 0) != starts(1, 0)
 
 
@@ -260,6 +261,17 @@ def test_info_says_what_a_codec_saves_and_whether_it_loses(tmp_path):
         infos[codec] = dataset.info()
     assert infos["jpeg"]["compression"] > 1.5 * infos["zstd"]["compression"]
     assert [infos[c]["lossless"] for c in ("zstd", "raw", "jpeg")] == [True, True, False]
+
+
+@pytest.mark.parametrize("size", [7, 9])
+def test_another_image_size_in_meta_json_is_found_at_reading(tmp_path, size):
+    made(tmp_path, chain(40))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps({**meta, "image_size": size}))
+    dataset = TrajectoryDataset.open(tmp_path)
+    with pytest.raises(ValueError, match=f"Trajectory 0 .* does not hold .* images of {size} x"):
+        dataset.sample(1, 4)
+    assert len(dataset.validate()) == 1
 
 
 def test_a_codec_of_a_newer_version_is_named(tmp_path):

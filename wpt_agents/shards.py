@@ -79,7 +79,10 @@ def _decode(
     images = min(BLOCK, entry.length + 1 - number * BLOCK)
     actions = min(BLOCK, entry.length - number * BLOCK)
     size, wide = meta.image_size, entry.action_dim
-    data = find_codec(meta.codec).decode(block, 4 * actions * (wide + entry.reward))
+    behind = 4 * actions * (wide + entry.reward)
+    data = find_codec(meta.codec).decode(block, behind)
+    if len(data) != images * size * size * 3 + behind:
+        raise OSError(f"block {number} does not hold {images} images of {size} x {size} pixels")
     image = np.frombuffer(data, np.uint8, images * size * size * 3)
     vector = np.frombuffer(data, np.float32, offset=image.nbytes)
     return (

@@ -16,7 +16,7 @@ LAYERS = [
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "importers", "world_model", "checks"},
     {"policy"},
-    {"rollout", "updates"},
+    {"rollout", "updates", "saving"},
     {"wpt"},
     {"zoo"},
 ]

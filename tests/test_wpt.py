@@ -200,7 +200,7 @@ def test_a_subset_has_an_index_of_its_own(store):
     for ids in ([0, 1], [2, 3]):
         model.set_dataset(store.subset(ids))
         first = next(store.subset(ids).first_observations())
-        np.testing.assert_array_equal(model.build_index().features, model.embed(first))
+        np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
     model.set_dataset(store)
     assert len(model.build_index()) == 6
 

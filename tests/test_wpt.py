@@ -1,6 +1,7 @@
 """Algorithm 1 from end to end, and each of its stages on its own."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -383,3 +384,33 @@ def test_open_loop_shows_the_context_and_then_a_dream(store):
 def test_the_forward_passes_can_run_in_bfloat16(store):
     model = pretrained(store, env=DotEnv(), precision="bf16").learn(2 * LENGTH)
     assert all(torch.isfinite(v).all() for v in weights(model).values())
+
+
+def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_reward(monkeypatch):
+    model, episode = agent(ClockEnv()), recorded(length=6)
+    episode = replace(episode, reward=np.arange(6, dtype=np.float32))
+    grey, three = (
+        (lambda state: torch.zeros(1, 7, 64, 64, 3)),
+        (lambda feat: torch.full((1, 7), 3.0)),
+    )
+    monkeypatch.setattr(
+        model.policy.world_model, "decode", grey
+    )  # 0 is the middle of black and white
+    monkeypatch.setattr(model.policy.world_model, "reward", three)
+    errors = model.policy.heldout_errors(episode)
+    by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()
+    assert errors["reconstruction"] == pytest.approx(by_hand, rel=1e-4)
+    assert errors["reward"] == pytest.approx(np.mean([3, 2, 1, 0, 1, 2]))
+    assert len(errors) == 2
+
+
+def test_every_episode_is_judged_before_it_is_replayed(monkeypatch):
+    model, seen = agent(ClockEnv()), []
+    judge = model.policy.heldout_errors
+    monkeypatch.setattr(
+        model.policy,
+        "heldout_errors",
+        lambda t: seen.append(len(model.replay_buffer.trajectories)) or judge(t),
+    )
+    model.learn(21)
+    assert seen == [0, 1, 2]

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from debug_agent import same, weights
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 
@@ -22,6 +21,7 @@ from wpt_agents.zoo import benchmark
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.checkpoints import last_checkpoint
 from wpt_agents.zoo.evaluation import make_vec_env
+from wpt_agents.zoo.progress import LearningBar
 
 CHANGES = {
     "learn": {"frames": 150, "checkpoint_every": 25},
@@ -33,15 +33,15 @@ class Killed(BaseException):
     """What a SIGKILL is to the process, for one that the test has to outlive."""
 
 
-class KillAt(BaseCallback):
+class KillAt(LearningBar):
     def __init__(self, step):
-        super().__init__()
+        super().__init__(frames_a_step=1)
         self.step = step
 
     def _on_step(self):
         if self.num_timesteps == self.step:
             raise Killed
-        return True
+        return super()._on_step()
 
 
 def killed_at(step, monkeypatch, one):

@@ -34,7 +34,7 @@ from torch import Generator, Tensor
 from torch.optim import AdamW
 from tqdm.auto import tqdm
 
-from wpt_agents.behavior_cloning import FRAMES, bc_loss, random_shift
+from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
@@ -44,7 +44,7 @@ from wpt_agents.networks import SIZES
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
-from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide
+from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, step_all
 from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, PRETRAIN, WARMUP, WINDOW, Updates, torch_seed
@@ -414,19 +414,14 @@ class WPT(Updates, Saving, BaseAlgorithm):
         """// Behavior Cloning Policy Training, on the retrieved trajectories."""
         if self.retrieved is None or self.cloned or parse_schedule(self.guidance)(0) == 0:
             return
-        policy, width = self.policy, self.max_action_dim
+        policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
         optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
         for step in tqdm(range(self.bc_steps), desc="clone", disable=not progress_bar):
-            generator = self._generator(CLONE, step)
-            rng = self._stream(CLONE, step)
-            batch = self.retrieved.sample(self.bc_batch_size, FRAMES + 1, width, rng)
-            batch = batch.to(self.device)
+            pairs = draw_pairs(shown, self.bc_batch_size, width, self._stream(CLONE, step))
+            image, action = (tensor.to(self.device) for tensor in pairs)
             with self._autocast():
-                frames = random_shift(batch.image[:, :FRAMES], generator=generator)
-                # the action that led to image F was taken at image F - 1, the last one shown
-                loss = bc_loss(
-                    policy.prior_actor(frames), batch.action[:, FRAMES], policy.action_mask
-                )
+                image = random_shift(image, generator=self._generator(CLONE, step))
+                loss = bc_loss(policy.prior_actor(image), action, policy.action_mask)
             self._descend(optimizer, loss, "bc")
         self.cloned = True
 
@@ -441,7 +436,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         while go_on and not ended and self.num_timesteps < self._total_timesteps:
             image, _ = to_images(self._last_obs)
             action = rollout.act(image, self._guide())
-            new_obs, rewards, dones, infos = self.env.step(self.policy.to_env(action))
+            new_obs, rewards, dones, infos = step_all(self.env, self.policy.to_env(action))
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.learning_starts:

@@ -37,6 +37,8 @@ class LearningBar(BaseCallback):
         self._move()
 
     def _on_step(self) -> bool:
+        frames = self.num_timesteps * self.frames_a_step
+        self.logger.record("time/frames", frames, exclude="tensorboard")
         return True
 
     def _on_training_end(self) -> None:

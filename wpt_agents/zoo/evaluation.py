@@ -1,6 +1,6 @@
 """How good a policy is: returns over seeded episodes, their mean and its 95 % interval."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,14 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.zoo.collect import Act, record
 from wpt_agents.zoo.progress import progress
-
-# Student's t at 97.5 % for 1 .. 30 degrees of freedom.
-T_975 = (
-    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
-    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
-    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
-)
-
+from wpt_agents.zoo.statistics import mean_interval
 
 Observation = np.ndarray | dict[str, np.ndarray]
 State = tuple[np.ndarray, ...]
@@ -64,16 +57,6 @@ class RandomPolicy:
         """Uniform draws, (n, A), whatever `deterministic` says."""
         low, high = self.action_space.low, self.action_space.high
         return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
-
-
-def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
-    """The mean and its 95 % interval by Student's t; no interval from one value."""
-    mean, n = float(np.mean(values)), len(values)
-    if n < 2:
-        return mean, None, None
-    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
-    half = t * float(np.std(values, ddof=1)) / n**0.5
-    return mean, mean - half, mean + half
 
 
 @dataclass(frozen=True)

@@ -121,6 +121,12 @@ class Saving:
         self.policy.load_state_dict(tensors["policy"])
         for name in self._get_torch_save_params()[0][1:]:
             load_optimizer(getattr(self, name), tensors[name])
+        missing = set(COUNTERS) - about["counters"].keys()
+        if missing:
+            raise ValueError(
+                f"The model file lacks {', '.join(sorted(missing))}: it was written by an earlier "
+                "wpt_agents; train it again, or load it with the version that wrote it"
+            )
         for name in COUNTERS:
             setattr(self, name, about["counters"][name])
 

@@ -24,8 +24,7 @@ _FLAGS = {
     "reflection": mujoco.mjtRndFlag.mjRND_REFLECTION,
 }
 
-
-Camera = str | int | dict[str, Any]
+Camera = str | int | dict[str, Any]  # a name, a number, or the free camera's attributes
 
 
 @dataclass(frozen=True)

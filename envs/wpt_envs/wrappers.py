@@ -103,6 +103,8 @@ class SeePixels(gym.Wrapper, RecordConstructorArgs):
             self, image_size=image_size, state_in_info=state_in_info, render_size=render_size
         )
         gym.Wrapper.__init__(self, env)
+        if min(image_size, render_size or image_size) < 1:
+            raise ValueError(f"{image_size=}, {render_size=}; give 1 or more")
         self._image_size, self._render_size = image_size, render_size or image_size
         self._state_in_info = state_in_info
         self._image: np.ndarray | None = None

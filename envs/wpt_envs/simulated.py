@@ -33,6 +33,8 @@ class Simulated(gym.Env):
     view: View
 
     def __init__(self, task: Task, seed: int | None, render_mode: str | None, fps: float) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"No render_mode {render_mode!r}. There are: 'rgb_array', None")
         self.task, self.render_mode = task, render_mode
         self.metadata = self.metadata | {"render_fps": fps}
         self._first_seed = seed

@@ -65,8 +65,8 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, times: int) -> None:
         RecordConstructorArgs.__init__(self, times=times)
         gym.Wrapper.__init__(self, env)
-        if times < 1:
-            raise ValueError(f"action_repeat={times}; give 1 or more")
+        if times < 1 or times != int(times):
+            raise ValueError(f"action_repeat={times}; give a whole number, 1 or more")
         self._times = times
         self.metadata = dict(env.metadata)
         if "render_fps" in env.metadata:

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from wpt_envs.tasks import TASKS
+from wpt_envs.tasks import TASKS, Task
 
 
 def main() -> None:
@@ -17,6 +17,8 @@ def main() -> None:
     montage.add_argument("--size", type=int, default=64)
     likeness = commands.add_parser("likeness", help="PSNR in dB against exact")
     likeness.add_argument("--states", type=int, default=20)
+    for command in (montage, likeness):
+        command.add_argument("--suite", choices=sorted({task.suite for task in TASKS.values()}))
     speed = commands.add_parser("speed", help="CPU ms an agent step, beside the usual renderer")
     speed.add_argument("--rounds", type=int, default=5, help="of ten steps each")
     arguments = vars(parser.parse_args())
@@ -38,20 +40,24 @@ def _list() -> None:
         )
 
 
-def _montage(path: Path, size: int) -> None:
+def _montage(path: Path, size: int, suite: str | None) -> None:
     from wpt_envs.measure import montage
 
-    montage(list(TASKS.values()), path, size)
+    montage(_chosen(suite), path, size)
 
 
-def _likeness(states: int) -> None:
+def _likeness(states: int, suite: str | None) -> None:
     from wpt_envs.measure import likeness
 
-    for task in TASKS.values():
+    for task in _chosen(suite):
         found = likeness(task, states)
         print(
             f"{task.id:44s} near {found['near']:5.1f} dB  fast {found['fast']:5.1f} dB", flush=True
         )
+
+
+def _chosen(suite: str | None) -> list[Task]:
+    return [task for task in TASKS.values() if suite in (None, task.suite)]
 
 
 def _speed(rounds: int) -> None:

@@ -54,6 +54,7 @@ QUALITIES = {
     "fast": Quality(
         samples=0,
         supersample=2,
+        shadow_size=0,
         tessellation=(10, 5, 1),
         floor_spacing=2,
         cell=0.005,

@@ -8,6 +8,7 @@ from wpt_agents.networks import (
     ChannelNorm,
     Decoder,
     Encoder,
+    FromPixel,
     Head,
     UpConv,
     frozen,
@@ -22,10 +23,12 @@ def noise(*shape, seed=0, dtype=torch.float32):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
-@pytest.mark.parametrize("kernel", [5, 6])
-@pytest.mark.parametrize("width", [1, 4, 13])
-def test_upconv_is_the_transposed_convolution_gradients_too(kernel, width):
-    ours = UpConv(3, 2, kernel).double()
+@pytest.mark.parametrize(
+    ("layer", "kernel", "width"),
+    [(FromPixel, 5, 1), *((UpConv, kernel, width) for kernel in (5, 6) for width in (1, 4, 13))],
+)
+def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, width):
+    ours = layer(3, 2, kernel).double()
     x = noise(2, 3, width, width, dtype=torch.float64).requires_grad_()
     plain = torch.nn.functional.conv_transpose2d(x, ours.weight, ours.bias, stride=2)
     result, leaves = ours(x), (x, ours.weight, ours.bias)

@@ -136,6 +136,17 @@ class UpConv(nn.ConvTranspose2d):
         return out.permute(0, 3, 1, 2)
 
 
+class FromPixel(nn.ConvTranspose2d):
+    """A transposed convolution of a single pixel, computed as the matrix product that it is."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, 1, 1) -> (N, outputs, K, K), channels last in memory."""
+        assert x.shape[-2:] == (1, 1), x.shape
+        weight = self.weight.permute(0, 2, 3, 1)  # (inputs, K, K, outputs)
+        out = (x.flatten(1) @ weight.flatten(1)).unflatten(1, weight.shape[1:]) + self.bias
+        return out.permute(0, 3, 1, 2)
+
+
 class Decoder(nn.Module):
     """The mean of p(o | h, z): two MLPs summed, then 1 > 5 > 13 > 30 > 64; no squashing."""
 
@@ -152,7 +163,7 @@ class Decoder(nn.Module):
             LinearNorm(size.stoch * size.classes, width), nn.Linear(width, code)
         )
         self.layers = nn.Sequential(
-            nn.ConvTranspose2d(code, 4 * depth, 5, 2),
+            FromPixel(code, 4 * depth, 5),
             ChannelNorm(4 * depth),
             nn.SiLU(),
             nn.ConvTranspose2d(4 * depth, 2 * depth, 5, 2),

@@ -79,6 +79,22 @@ def test_the_encoder_takes_any_leading_axes():
     assert encoder(image).shape == (2, 3, encoder.embed_dim)
 
 
+@pytest.mark.parametrize("part", ["encoder", "decoder"])
+def test_image_layers_in_pieces_are_those_of_all_images_at_once(part, monkeypatch):
+    torch.manual_seed(0)
+    image = torch.randint(256, (7, 64, 64, 3), dtype=torch.uint8)
+    net = Encoder(4) if part == "encoder" else Decoder(DEBUG)
+    inputs = (image,) if part == "encoder" else (noise(7, 64), noise(7, 8, 8, seed=1))
+    outputs, gradients = [], []
+    for rows in (7, 3):  # a split leaves one row over
+        monkeypatch.setattr("wpt_agents.networks.PIECE", rows * 32 * 32 * 12)
+        outputs.append(net(*inputs))
+        total = (outputs[-1] * noise(*outputs[-1].shape, seed=2)).sum()
+        gradients.append(torch.autograd.grad(total, list(net.parameters())))
+    torch.testing.assert_close(*outputs)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
+
+
 def test_the_decoder_makes_images_and_depends_on_both_parts():
     decoder, deter, stoch = Decoder(DEBUG), noise(2, 64), noise(2, 8, 8)
     image = decoder(deter, stoch)

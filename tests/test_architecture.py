@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = [
     {"trajectory", "distributions", "networks", "guidance", "archive", "names"},
-    {"windows", "shards", "model_file"},
+    {"windows", "shards", "model_file", "scan"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "importers", "world_model", "checks"},
     {"policy"},

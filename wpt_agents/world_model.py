@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import BINS, kl_one_hot, two_hot_loss, two_hot_mean
@@ -45,7 +46,7 @@ def world_model_loss(
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
     assert post_logits.shape == prior_logits.shape, (post_logits.shape, prior_logits.shape)
-    error = (reconstruction - image).square().sum((-1, -2, -3)).mean()
+    error = F.mse_loss(reconstruction, image, reduction="sum") / image.shape[:-3].numel()
     dyn = kl_one_hot(post_logits.detach(), prior_logits)
     rep = kl_one_hot(post_logits, prior_logits.detach())
     if free_nats_mode not in ("mean", "element"):

@@ -198,12 +198,28 @@ def test_an_index_of_another_encoder_is_refused(store):
 def test_a_subset_has_an_index_of_its_own(store):
     model = pretrained(store)
     model.build_index()
-    for ids in ([0, 1], [2, 3]):
+    for ids in ([0, 1], [2, 3], [5, 4, 3, 2, 1, 0], [0, 0, 1, 2, 3, 4]):
         model.set_dataset(store.subset(ids))
         first = next(store.subset(ids).first_observations())
         np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
     model.set_dataset(store)
-    assert len(model.build_index()) == 6
+    whole = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.embed(whole))
+
+
+def test_an_index_of_other_trajectories_is_built_anew(store):
+    model = pretrained(store)
+    model.build_index()
+    size = (store.path / "shard-00000.bin").stat().st_size
+    content = bytearray((store.path / "shard-00000.bin").read_bytes())
+    content[size - 10] ^= 1
+    (store.path / "shard-00000.bin").write_bytes(content)
+    store.validate(set_aside=True)
+    with store:
+        store.append(recorded(seed=9))  # as many as before
+    assert len(store) == 6
+    first = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.embed(first))
 
 
 def test_an_index_that_cannot_be_written_is_kept_in_memory(store, monkeypatch):

@@ -28,6 +28,7 @@ class Retriever:
     :param action_dims: (N,) int
     :param embodiments: N names, None where unknown
     :param encoder_id: which encoder made the features, e.g. a hash of its weights
+    :param dataset_id: of which trajectories, e.g. the dataset's fingerprint
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class Retriever:
         action_dims: np.ndarray,
         embodiments: Sequence[str | None],
         encoder_id: str,
+        dataset_id: str = "",
     ) -> None:
         assert len(features) == len(action_dims) == len(embodiments), len(features)
         if not np.isfinite(features).all():
@@ -43,7 +45,7 @@ class Retriever:
         self.features = np.ascontiguousarray(features, np.float32)
         self.action_dims = np.asarray(action_dims)
         self.embodiments = list(embodiments)
-        self.encoder_id = encoder_id
+        self.encoder_id, self.dataset_id = encoder_id, dataset_id
 
     @classmethod
     def build(
@@ -69,7 +71,8 @@ class Retriever:
                 features[at : at + len(image)] = found
                 at += len(image)
                 bar.update(len(image))
-        return cls(features, dataset.action_dims, dataset.embodiments, encoder_id)
+        labels = dataset.action_dims, dataset.embodiments
+        return cls(features, *labels, encoder_id, dataset.fingerprint)
 
     @classmethod
     def beside(
@@ -79,15 +82,15 @@ class Retriever:
         encoder_id: str,
         progress_bar: bool = False,
     ) -> "Retriever":
-        """The index that stands beside the dataset; built and saved if missing or too short.
+        """The index that stands beside the dataset; built and saved if missing or out of date.
 
         A subset's is built each time, since the folder's is of the whole dataset.
         """
         path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
-        whole = len(dataset) == len(TrajectoryDataset.open(path.parent))
+        whole = not dataset.is_subset
         if whole and path.exists():
             retriever = cls.load(path, encoder_id)
-            if len(retriever) == len(dataset):
+            if retriever.dataset_id == dataset.fingerprint:
                 return retriever
         retriever = cls.build(dataset, embed, encoder_id, progress_bar)
         try:
@@ -98,7 +101,7 @@ class Retriever:
         return retriever
 
     def __len__(self) -> int:
-        """The number of trajectories; another than the dataset's means: build it again."""
+        """The number of trajectories."""
         return len(self.features)
 
     def search(
@@ -144,7 +147,11 @@ class Retriever:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file, whole or not at all."""
-        about = {"encoder_id": self.encoder_id, "embodiments": self.embodiments}
+        about = {
+            "encoder_id": self.encoder_id,
+            "dataset_id": self.dataset_id,
+            "embodiments": self.embodiments,
+        }
         arrays = {"features": self.features, "action_dims": self.action_dims}
         save_arrays(path, "Retriever", about, arrays)
 
@@ -160,4 +167,5 @@ class Retriever:
                 f"{path} was built with the encoder {about['encoder_id']}, this one is "
                 f"{encoder_id}; delete the file and build the index again"
             )
-        return cls(arrays["features"], arrays["action_dims"], about["embodiments"], encoder_id)
+        labels = arrays["action_dims"], about["embodiments"]
+        return cls(arrays["features"], *labels, encoder_id, about.get("dataset_id", ""))

@@ -1,1 +1,1 @@
-"""What the library costs, measured: one module a subject."""
+"""What the library costs, measured: one module a subject, each with `rows`."""

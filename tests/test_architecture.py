@@ -12,11 +12,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = [
     {"trajectory", "distributions", "networks", "guidance", "archive", "names", "codecs"},
-    {"windows", "index", "shards", "model_file"},
+    {"windows", "index", "shards", "model_file", "scan"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "importers", "world_model", "checks"},
     {"policy"},
-    {"rollout", "updates"},
+    {"rollout", "updates", "saving"},
     {"wpt"},
     {"zoo"},
 ]

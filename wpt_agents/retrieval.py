@@ -8,7 +8,9 @@ Example::
 """
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch  # noqa: F401  # before faiss: the other way round crashes on some builds
@@ -71,6 +73,32 @@ class Retriever:
                 bar.update(len(image))
         labels = dataset.action_dims, dataset.embodiments
         return cls(features, *labels, encoder_id, dataset.fingerprint)
+
+    @classmethod
+    def beside(
+        cls,
+        dataset: TrajectoryDataset,
+        embed: Callable[[np.ndarray], np.ndarray],
+        encoder_id: str,
+        progress_bar: bool = False,
+    ) -> "Retriever":
+        """The index that stands beside the dataset; built and saved if missing or out of date.
+
+        A subset's is built each time, since the folder's is of the whole dataset.
+        """
+        path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
+        whole = not dataset.is_subset
+        if whole and path.exists():
+            retriever = cls.load(path, encoder_id)
+            if retriever.dataset_id == dataset.fingerprint:
+                return retriever
+        retriever = cls.build(dataset, embed, encoder_id, progress_bar)
+        try:
+            if whole:
+                retriever.save(path)
+        except OSError as error:
+            warnings.warn(f"The index is kept in memory only: {error}", stacklevel=2)
+        return retriever
 
     def __len__(self) -> int:
         """The number of trajectories."""

@@ -114,13 +114,6 @@ class Batch:
         """The same batch in pinned memory."""
         return Batch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
-    @staticmethod
-    def cat(batches: Sequence["Batch"]) -> "Batch":
-        """Joins batches of one length along B."""
-        return Batch(
-            **{f.name: torch.cat([getattr(b, f.name) for b in batches]) for f in fields(Batch)}
-        )
-
 
 def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[str, np.ndarray]:
     """Images start .. stop - 1 of a trajectory, each with the action and reward that led to it.

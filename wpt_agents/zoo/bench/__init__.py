@@ -1,1 +1,1 @@
-"""Measurements of speed, size and memory, each a module with `rows`."""
+"""What the library costs, measured: one module a subject, each with `rows`."""

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from wpt_agents.importers.convert import Conversions
 from wpt_agents.shards import (
     BLOCK,
     Entry,
@@ -48,7 +49,7 @@ class _Part(Trajectory):
         pass
 
 
-class TrajectoryDataset:
+class TrajectoryDataset(Conversions):
     """Trajectories in a folder (see `wpt_agents.shards`); one writer, any number of readers.
 
     A reader sees the trajectories that were there when it opened the folder. Nothing but the index

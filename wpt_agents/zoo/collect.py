@@ -64,6 +64,11 @@ def noise_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Ac
     return lambda obs, info, step: noise[step], f"{colour} noise, amplitude {amplitude:.2f}"
 
 
+def random_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Act, str]:
+    """Uniform actions, each step's drawn anew, and their name."""
+    return lambda obs, info, step: rng.uniform(-1, 1, width), "uniform random actions"
+
+
 def scripted_actions(rng: np.random.Generator, task: str, sigma: float) -> tuple[Act, str]:
     """Meta-World's own scripted policy with Gaussian noise, and its name."""
     from metaworld.policies import ENV_POLICY_MAP  # loads a simulator

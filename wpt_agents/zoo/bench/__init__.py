@@ -1,0 +1,1 @@
+"""Measurements of the library, one module a subject; each has `rows`."""

@@ -1,5 +1,7 @@
 """The runner end to end, on a toy task and the smallest networks."""
 
+import csv
+import io
 import json
 import sys
 
@@ -17,9 +19,10 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import benchmark, report, stages
 from wpt_agents.zoo.benchmark import run
-from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate, mean_interval
+from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.presets import Preset
+from wpt_agents.zoo.statistics import mean_interval
 
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
 SECTIONS = {
@@ -208,7 +211,9 @@ def test_one_value_has_no_interval():
 
 def fake_result(seed, mean, method="wpt", task="dmc-walker-run"):
     about = {"task": task, "method": method, "preset": "paper", "seed": seed, "frames": 150_000}
-    return about | {"metric": "return", "scores": {"WPT": {"mean": mean, "success_rate": None}}}
+    returns = [mean - 10, mean + 10]
+    score = {"mean": mean, "success_rate": None, "returns": returns, "low": None, "high": None}
+    return about | {"metric": "return", "commit": "abc", "scores": {"WPT": score}}
 
 
 def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
@@ -239,6 +244,43 @@ def test_the_report_prints_as_table_and_as_markdown(capsys):
         assert "1.23" in text
         assert "457" in text
     assert report.markdown(rows).count("\n") == 4
+
+
+def test_every_policy_has_its_seeds_and_three_intervals():
+    results = [fake_result(seed, mean) for seed, mean in enumerate((700.0, 710.0, 720.0))]
+    (row,) = report.policies(results)
+    assert (row.policy, row.seeds, row.means, row.mean) == ("WPT", (0, 1, 2), (700, 710, 720), 710)
+    # six episodes, each 10 from its seed's mean: sd of the mean 10 / sqrt(6) = 4.1, extremes 700
+    assert 700 <= row.episodes_low < 705 and 715 < row.episodes_high <= 720
+    # all three draws the same seed: probability 1/27 > 2.5 %
+    assert (row.seeds_low, row.seeds_high) == (700, 720)
+    assert (row.t_low, row.t_high) == pytest.approx((685.2, 734.8), abs=0.1)
+    assert (row.episodes, row.commits, row.success) == (2, ("abc",), None)
+
+
+def test_untrained_policies_are_told_once_however_many_methods_met_them():
+    results = [fake_result(0, 5.0, method) for method in ("wpt", "scratch")]
+    for result in results:
+        result["scores"] = {"nothing": fake_result(0, 1.0)["scores"]["WPT"]} | result["scores"]
+    rows = report.policies(results)
+    assert [(row.method, row.policy) for row in rows] == [
+        ("", "nothing"),
+        ("scratch", "WPT"),
+        ("wpt", "WPT"),
+    ]
+    assert rows[0].seeds_low is None  # one seed
+    told = report.policy_markdown(rows)
+    assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in told
+    assert "| WPT, scratch | 5.0 |" in told
+    assert "Seeds 0, 2 episodes each; commit abc." in told
+
+
+def test_the_csv_reads_back_unrounded():
+    rows = report.policies([fake_result(seed, 1 / 3 + seed) for seed in (0, 4)])
+    (read,) = csv.DictReader(io.StringIO(report.policy_csv(rows)))
+    assert read["means"] == f"{rows[0].means[0]} {rows[0].means[1]}" and read["seeds"] == "0 4"
+    assert float(read["mean"]) == rows[0].mean
+    assert read["success"] == ""
 
 
 def call(monkeypatch, *words):
@@ -310,3 +352,8 @@ def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
     assert json.loads((folder / "result.json").read_text())["frames"] == 50
     assert call(monkeypatch, "report", tmp_path) == 0
     assert "dmc-dot" in capsys.readouterr().out
+    assert call(monkeypatch, "report", tmp_path, "--markdown") == 0
+    told = capsys.readouterr().out
+    assert all(f"| {name} |" in told for name in ("doing nothing", "prior actor", "WPT"))
+    assert call(monkeypatch, "report", tmp_path, "--csv") == 0
+    assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")

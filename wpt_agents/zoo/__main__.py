@@ -133,16 +133,23 @@ def report_results(
         "runs"
     ),
     markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
+    csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
 ) -> None:
-    """Shows the mean over seeds of every task and method, with its 95 % interval."""
+    """Shows the mean over seeds of every task and method, with its 95 % interval.
+
+    Markdown and CSV also have every policy: doing nothing, random, prior actor, WPT.
+    """
     from wpt_agents.zoo import report
     from wpt_agents.zoo.stages import console
 
-    rows = report.summarise(report.read_results(folder))
-    if not rows:
+    results = report.read_results(folder)
+    if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
-    if markdown:
-        typer.echo(report.markdown(rows), nl=False)
+    rows, policies = report.summarise(results), report.policies(results)
+    if csv:
+        typer.echo(report.policy_csv(policies), nl=False)
+    elif markdown:
+        typer.echo(f"{report.markdown(rows)}\n{report.policy_markdown(policies)}", nl=False)
     else:
         console.print(report.summary_table(rows))
 

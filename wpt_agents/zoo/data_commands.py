@@ -34,21 +34,52 @@ def collect_data(
     out: Annotated[Path, typer.Option(help="The dataset's folder; half of one is continued.")],
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006  # typer wants a list
-    episodes: Annotated[int, typer.Option(min=1, help="Of each task.")] = 30,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Of each task. None: as many as the paper's.")
+    ] = None,
     seed: int = 0,
     workers: Workers = 2,
-    behaviour: Annotated[str, typer.Option(help="noise, or scripted (Meta-World).")] = "noise",
+    behaviour: Annotated[
+        str,
+        typer.Option(
+            help="noise, random, scripted (Meta-World), policy, icm or plan2explore. None: "
+            "scripted in metaworld, elsewhere noise."
+        ),
+    ] = "",
+    sigma: Annotated[
+        list[float], typer.Option(help="Noise on scripted and saved policies, in turn by episode.")
+    ] = [0.1, 0.3, 0.5, 1.0, 2.0],  # noqa: B006
+    policy: Annotated[
+        str | None, typer.Option(help="For policy: a WPT model file, or SB3's as `sac:FILE`.")
+    ] = None,
+    rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
+    settings: Annotated[
+        list[str],
+        typer.Option("--set", metavar="KEY=VALUE", help="For icm, plan2explore: WPT's keywords."),
+    ] = [],  # noqa: B006
     rendering: Annotated[str, typer.Option(help="exact, near or fast.")] = "near",
 ) -> None:
-    """Plays tasks with noise and stores the episodes without rewards.
+    """Plays tasks and stores the episodes, without rewards unless asked for.
 
-    Example: `python -m wpt_agents.zoo collect --tasks walker-run cartpole-swingup --out data`
+    By default as the paper: in metaworld 50 tasks x 5 strengths of noise x 200 episodes of scripted
+    policies, in dmc 2000 episodes of each of 5 robots.
+
+    Example: `python -m wpt_agents.zoo collect --tasks walker-run --behaviour icm --out data`
     """
     from wpt_agents.zoo.collect import collect
+    from wpt_agents.zoo.presets import keywords, load_preset, suite_names
     from wpt_agents.zoo.tasks import find_tasks
 
-    ids = [row.id for row in find_tasks(suite, tasks)]
-    dataset = collect(out, ids, episodes, seed, workers, behaviour, {"rendering": rendering})
+    paper = load_preset(suite, "paper").collect if suite in suite_names() else None
+    names = tasks or (paper.tasks if paper else ())
+    ids = [row.id for row in find_tasks(suite, names)]
+    episodes = episodes or (paper.episodes if paper else 30)
+    behaviour = behaviour or (paper.behaviour if paper else "noise")
+    typer.echo(f"{len(ids)} tasks x {episodes} episodes, {behaviour}, in {out}")
+    dataset = collect(
+        out, ids, episodes, seed, workers, behaviour, {"rendering": rendering},
+        rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings),
+    )  # fmt: skip
     _print_info(dataset)
 
 

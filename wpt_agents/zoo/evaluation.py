@@ -1,8 +1,9 @@
 """How good a policy is: returns over seeded episodes, their mean and its 95 % interval."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import gymnasium as gym
@@ -15,16 +16,10 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.zoo.collect import Act, record
+from wpt_agents.zoo.behaviours import Act
+from wpt_agents.zoo.collect import record
 from wpt_agents.zoo.progress import progress
-
-# Student's t at 97.5 % for 1 .. 30 degrees of freedom.
-T_975 = (
-    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
-    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
-    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
-)
-
+from wpt_agents.zoo.statistics import mean_interval
 
 Observation = np.ndarray | dict[str, np.ndarray]
 State = tuple[np.ndarray, ...]
@@ -65,16 +60,6 @@ class RandomPolicy:
         return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
-    """The mean and its 95 % interval by Student's t; no interval from one value."""
-    mean, n = float(np.mean(values)), len(values)
-    if n < 2:
-        return mean, None, None
-    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
-    half = t * float(np.std(values, ddof=1)) / n**0.5
-    return mean, mean - half, mean + half
-
-
 @dataclass(frozen=True)
 class Score:
     """The returns of one policy, and successes where the task reports them."""
@@ -99,13 +84,42 @@ class Score:
         return cls(given["returns"], given["successes"])
 
 
+class EpisodeSeeds(gym.Wrapper):
+    """Seeds each reset by the number of the episode, so that an episode depends on none before it.
+
+    A seed given to `reset` is that of episode 0, and those of all others are derived from it.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.seed, self.episode = 0, 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins the next episode."""
+        self.seed = self.seed if seed is None else seed
+        drawn = np.random.SeedSequence([self.seed, self.episode]).generate_state(1)
+        own = int(drawn[0] >> 1) if self.episode else self.seed
+        self.episode += 1
+        return self.env.reset(seed=own, options=options)
+
+    def go_to_episode(self, number: int) -> None:
+        """The next reset begins episode `number`."""
+        self.episode = number
+
+
 def make_vec_env(
     task: str, env: Mapping[str, Any], seed: int, n_envs: int = 1, monitor: str | None = None
 ) -> VecEnv:
-    """Seeded copies of a task in one process, each under SB3's Monitor."""
+    """Seeded copies of a task in one process, each under SB3's Monitor.
+
+    :param monitor: the file of its episodes, which is continued if it is there
+    """
+    anew = monitor is None or not Path(monitor).exists()
 
     def make() -> gym.Env:
-        return Monitor(gym.make(task, **env), monitor, info_keywords=())
+        return Monitor(EpisodeSeeds(gym.make(task, **env)), monitor, override_existing=anew)
 
     venv = DummyVecEnv([make] * n_envs)
     venv.seed(seed)

@@ -75,9 +75,13 @@ class PretrainSettings(Section):
 
 @dataclass(frozen=True)
 class LearnSettings(Section):
-    """Fine-tuning; `frames` are simulator frames, `env.step` calls times the action repeat."""
+    """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
+
+    `checkpoint_every` so many frames a killed run can go on from there; 0: only from the end.
+    """
 
     frames: int = 150_000
+    checkpoint_every: int = 10_000
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,17 @@ def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
         for title, section in part.items():
             given[title] = {**given.get(title, {}), **(section or {})}
     return Preset.of(given)
+
+
+def keywords(settings: Sequence[str]) -> dict[str, Any]:
+    """Keywords of WPT from "key=value" each, every name valid, or ValueError."""
+    given: dict[str, Any] = {}
+    for title, section in (pair for text in settings for pair in _setting(text).items()):
+        for name in section:
+            if title != "wpt" or name not in wpt_keywords():
+                raise unknown_name("WPT keyword", name, wpt_keywords())
+        given |= section
+    return given
 
 
 def _setting(text: str) -> dict[str, dict[str, Any]]:

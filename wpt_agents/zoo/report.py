@@ -1,17 +1,21 @@
 """Run folders -> tables: one run's policies, and many runs' means over seeds."""
 
 import csv
+import io
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 from rich.table import Table
 
-from wpt_agents.zoo.evaluation import mean_interval
 from wpt_agents.zoo.presets import preset_folder
+from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval
+
+POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,79 @@ def _score(result: Mapping[str, Any]) -> float:
     return score["success_rate"] if result["metric"] == "success" else score["mean"]
 
 
+@dataclass(frozen=True)
+class PolicyRow:
+    """One policy on one task over its seeds, by return. Intervals are of 95 %.
+
+    :param method: "" for a policy that no method has a part in
+    :param means: of each seed, over its `episodes` episodes
+    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again
+    :param seeds_low: bootstrap of the seeds' means: were other seeds trained
+    :param t_low: the same by Student's t, which is wider for few seeds
+    :param success: share of episodes that end in success, None where the task counts none
+    """
+
+    task: str
+    preset: str
+    frames: int
+    method: str
+    policy: str
+    episodes: int
+    seeds: tuple[int, ...]
+    means: tuple[float, ...]
+    mean: float
+    episodes_low: float
+    episodes_high: float
+    seeds_low: float | None
+    seeds_high: float | None
+    t_low: float | None
+    t_high: float | None
+    success: float | None
+    commits: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, group: tuple[str, str, int, str, str], runs: Mapping[int, Mapping[str, Any]]
+    ) -> Self:
+        """Builds the row from a policy's `scores` of each seed, each with its run's commit."""
+        seeds = sorted(runs)
+        returns = [np.array(runs[seed]["returns"], float) for seed in seeds]
+        means = [float(each.mean()) for each in returns]
+        rates = [runs[seed]["success_rate"] for seed in seeds]
+        middle, *student = mean_interval(means)
+        return cls(
+            *group,
+            min(map(len, returns)),
+            tuple(seeds),
+            tuple(means),
+            middle,
+            *map(float, bootstrap(mean, returns)),
+            *(map(float, bootstrap(mean, [np.array(means)])) if len(seeds) > 1 else (None, None)),
+            *student,
+            None if None in rates else float(np.mean(rates)),
+            tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),
+        )
+
+
+def policies(results: Iterable[Mapping[str, Any]]) -> list[PolicyRow]:
+    """One row for each task, preset, budget and policy; the untrained policies come first."""
+    groups: dict[tuple[str, str, int, str, str], dict[int, Mapping[str, Any]]] = defaultdict(dict)
+    for result in results:
+        about = result["task"], result["preset"], result["frames"]
+        for policy, score in result["scores"].items():
+            method = "" if policy in POLICIES else result["method"]
+            commit = {"commit": result.get("commit")}
+            groups[*about, method, policy][result["seed"]] = score | commit
+    return [PolicyRow.of(*item) for item in sorted(groups.items(), key=_by_method)]
+
+
+def _by_method(item: tuple[tuple[str, str, int, str, str], Any]) -> tuple[Any, ...]:
+    """The order of rows; within a method as the run reports them."""
+    (*about, method, policy), _ = item
+    order = (*POLICIES, "prior actor", "WPT")
+    return (*about, method, order.index(policy) if policy in order else len(order))
+
+
 def paper_scores() -> dict[tuple[str, str], float]:
     """(task, method) -> the paper's score at 150,000 frames."""
     scores = {}
@@ -92,13 +169,12 @@ def scores_table(result: Mapping[str, Any]) -> Table:
     successes = result["metric"] == "success"
     if successes:
         table.add_column("success", justify="right")
-    names = {"nothing": "doing nothing", "random": "random policy"}
     for name, score in result["scores"].items():
         cells = number(score["mean"]), interval_text(score["low"], score["high"])
         extremes = number(min(score["returns"])), number(max(score["returns"]))
         style = "bold" if name == "WPT" else None
         rate = [number(score["success_rate"])] if successes else []
-        table.add_row(names.get(name, name), *cells, *extremes, *rate, style=style)
+        table.add_row(POLICIES.get(name, name), *cells, *extremes, *rate, style=style)
     return table
 
 
@@ -125,5 +201,64 @@ def summary_table(rows: Sequence[Row]) -> Table:
 
 def markdown(rows: Sequence[Row]) -> str:
     """The rows as a Markdown table."""
-    lines = [HEADINGS, ["---"] * len(HEADINGS), *map(cells, rows)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return markdown_table(HEADINGS, map(cells, rows))
+
+
+def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Text in columns, as Markdown."""
+    every = [headings, ["---"] * len(headings), *lines]
+    return "".join(f"| {' | '.join(line)} |\n" for line in every)
+
+
+POLICY_HEADINGS = (
+    *("policy", "mean return of each seed", "mean"),
+    *("95 %, episodes", "95 %, seeds", "95 %, seeds by t", "success at the last step"),
+)
+
+
+def policy_cells(row: PolicyRow) -> list[str]:
+    """A row as text, in the order of POLICY_HEADINGS."""
+    name = POLICIES.get(row.policy, row.policy)
+    success = "-" if row.success is None else f"{row.success:.2f}"
+    return [
+        f"{name}, {row.method}" if row.method not in ("", "wpt") else name,
+        ", ".join(map(number, row.means)),
+        number(row.mean),
+        interval_text(row.episodes_low, row.episodes_high),
+        interval_text(row.seeds_low, row.seeds_high),
+        interval_text(row.t_low, row.t_high),
+        success,
+    ]
+
+
+def by_task(rows: Iterable[PolicyRow]) -> dict[str, list[PolicyRow]]:
+    """The rows of each task, preset and budget, under a heading that names them."""
+    tables: dict[str, list[PolicyRow]] = defaultdict(list)
+    for row in rows:
+        tables[f"{row.task}, preset {row.preset}, {row.frames:,} frames"].append(row)
+    return dict(tables)
+
+
+def policy_markdown(rows: Sequence[PolicyRow]) -> str:
+    """A Markdown table for each task, seeds and commits under it."""
+    parts = []
+    for title, table in by_task(rows).items():
+        seeds = sorted({seed for row in table for seed in row.seeds})
+        commits = sorted({commit for row in table for commit in row.commits})
+        episodes = min(row.episodes for row in table)
+        about = f"Seeds {', '.join(map(str, seeds))}, {episodes} episodes each; "
+        about += f"commit {', '.join(commits)}."
+        lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
+        parts.append(f"### {title}\n\n{lines}\n{about}\n")
+    return "\n".join(parts)
+
+
+def policy_csv(rows: Sequence[PolicyRow]) -> str:
+    """The rows as CSV, unrounded; seeds, their means and commits are separated by spaces."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, [field.name for field in fields(PolicyRow)], lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        spaced = {k: " ".join(map(str, v)) for k, v in asdict(row).items() if isinstance(v, tuple)}
+        writer.writerow(asdict(row) | spaced)
+    return file.getvalue()

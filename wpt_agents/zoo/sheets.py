@@ -123,7 +123,7 @@ def query_at(task: Task, rendering: str) -> Query:
 def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
     """The nearest by Eq. (5), the query's own trajectory left out."""
     known = (query.embodiment, query.action_dim) if own_robot else (None, None)
-    feature = model.embed(query.image[None])[0]
+    feature = model.policy.embed(query.image[None])[0]
     indices, distances = model.build_index().search(feature, number + 1, *known)
     others = indices != (-1 if query.own is None else query.own)
     return Found(query, indices[others][:number], distances[others][:number])

@@ -1,1 +1,1 @@
-"""Measurements of the library, one module a subject; each has `rows`."""
+"""What the library costs, measured: one module a subject, each with `rows`."""

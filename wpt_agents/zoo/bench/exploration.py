@@ -14,7 +14,8 @@ import gymnasium as gym
 import numpy as np
 
 from wpt_agents.exploration import EXPLORE, EXPLORERS
-from wpt_agents.zoo.collect import Act, noise_actions, random_actions, record
+from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions
+from wpt_agents.zoo.collect import record
 
 TASK = "wpt/dmc-walker-stand-v0"
 BEHAVIOURS = ("random", "noise", "icm", "plan2explore")

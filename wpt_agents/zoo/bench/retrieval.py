@@ -55,7 +55,7 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
         dataset, steps=STEPS, seed=0, run_dir=FOLDER / "model", device="cpu", progress_bar=True,
         **MODEL,
     )  # fmt: skip
-    encoders: dict[str, Embed] = {f"pre-trained, {STEPS} updates": trained.embed}
+    encoders: dict[str, Embed] = {f"pre-trained, {STEPS} updates": trained.policy.embed}
     for seed in range(3):
         encoders[f"untrained, seed {seed}"] = WPT(
             "WPTPolicy", seed=seed, device="cpu", **MODEL

@@ -1,0 +1,91 @@
+"""What many runs say together: aggregates, bootstrap intervals, profiles, comparisons.
+
+The definitions are those of Agarwal et al., Deep RL at the Edge of the Statistical Precipice
+(arXiv:2108.13264), and of their package rliable. `Scores` are one array a stratum, which is a task
+with one score a run, or a seed with one return an episode; strata may differ in length. Every
+statistic takes arrays with leading axes too, as resampling makes them.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+Scores = Sequence[np.ndarray]  # (..., n) a stratum
+DRAWS = 20_000
+
+# Student's t at 97.5 % for 1 .. 30 degrees of freedom.
+T_975 = (
+    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
+    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
+    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
+)
+
+
+def mean(scores: Scores) -> np.ndarray:
+    """The mean over strata of each stratum's mean, (...)."""
+    return np.mean([stratum.mean(-1) for stratum in scores], axis=0)
+
+
+def median(scores: Scores) -> np.ndarray:
+    """The median over strata of each stratum's mean, (...)."""
+    return np.median([stratum.mean(-1) for stratum in scores], axis=0)
+
+
+def iqm(scores: Scores) -> np.ndarray:
+    """The interquartile mean, (...): all scores together, a quarter cut off at each end."""
+    every = np.sort(np.concatenate(scores, axis=-1), axis=-1)
+    cut = every.shape[-1] // 4
+    return every[..., cut : every.shape[-1] - cut].mean(-1)
+
+
+def optimality_gap(scores: Scores, target: float = 1.0) -> np.ndarray:
+    """By how much all scores together fall short of `target`, (...); what exceeds it counts 0."""
+    return target - np.minimum(np.concatenate(scores, axis=-1), target).mean(-1)
+
+
+def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
+    """The share of all scores above each threshold, (..., thresholds)."""
+    every = np.concatenate(scores, axis=-1)
+    return np.stack([(every > threshold).mean(-1) for threshold in thresholds], axis=-1)
+
+
+def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
+    """How likely a run of ours beats one of theirs on the same task, ties half; mean over tasks.
+
+    :param ours: a stratum a task, in the same order as `theirs`
+    """
+    assert len(ours) == len(theirs), (len(ours), len(theirs))
+    chances = []
+    for x, y in zip(ours, theirs, strict=True):
+        x, y = x[..., :, None], y[..., None, :]
+        chances.append(((x > y) + 0.5 * (x == y)).mean((-2, -1)))
+    return np.mean(chances, axis=0)
+
+
+def resample(scores: Scores, draws: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """The stratified bootstrap: each stratum drawn anew from itself, (draws, n) a stratum."""
+    return [s[rng.integers(len(s), size=(draws, len(s)))] for s in scores]
+
+
+def bootstrap(
+    statistic: Callable[..., np.ndarray], *groups: Scores, draws: int = DRAWS, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The 95 % percentile interval of `statistic(*groups)`, each group resampled by itself.
+
+    :param groups: each a sequence of (n,) strata
+    :return: lower and upper end, each of the statistic's shape
+    """
+    rng = np.random.default_rng(seed)
+    drawn = statistic(*(resample(group, draws, rng) for group in groups))
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    return low, high
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
+    """The mean and its 95 % interval by Student's t; no interval from one value."""
+    middle, n = float(np.mean(values)), len(values)
+    if n < 2:
+        return middle, None, None
+    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
+    half = t * float(np.std(values, ddof=1)) / n**0.5
+    return middle, middle - half, middle + half

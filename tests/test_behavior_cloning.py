@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 import torch
 
-from wpt_agents.behavior_cloning import FRAMES, PriorActor, bc_loss, random_shift
+from wpt_agents.behavior_cloning import FRAMES, PriorActor, bc_loss, draw_pairs, random_shift
 from wpt_agents.networks import SIZES
+from wpt_agents.trajectory import Trajectory
 
 OWN = torch.tensor([True, True, False])
 
@@ -93,3 +95,22 @@ def crop(padded, i, j):
 
 def test_no_shift_leaves_the_image_alone():
     assert torch.equal(random_shift(frames(), 0), frames())
+
+
+def test_a_pair_is_what_was_seen_up_to_a_step_and_the_action_taken_at_it():
+    # image t of episode i is all 10 i + t, and the action taken at it 0.1 i + 0.01 t
+    def episode(i, steps):
+        times = np.arange(steps + 1)
+        image = np.broadcast_to((10 * i + times)[:, None, None, None], (steps + 1, 64, 64, 3))
+        action = np.full((steps, 2), 0.1 * i) + 0.01 * times[:-1, None]
+        return Trajectory(image.astype(np.uint8), action.astype(np.float32))
+
+    image, action = draw_pairs([episode(1, 4), episode(2, 1)], 400, 3, np.random.default_rng(0))
+    assert image.shape == (400, FRAMES, 64, 64, 3) and action.shape == (400, 3)
+    shown, taken = image[:, :, 0, 0, 0].tolist(), action[:, 0].tolist()
+    pairs = {(*frames, round(a, 2)) for frames, a in zip(shown, taken, strict=True)}
+    first = {(10, 10, 10, 0.1), (10, 10, 11, 0.11), (10, 11, 12, 0.12), (11, 12, 13, 0.13)}
+    assert pairs == first | {(20, 20, 20, 0.2)}
+    assert (action[:, 2] == 0).all()
+    share = sum(frames[-1] == 20 for frames in shown) / 400  # one step of five
+    assert share == pytest.approx(0.2, abs=0.06)

@@ -1,13 +1,10 @@
 import json
 import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 from chain import chain, check_chain, tensors
 
 from wpt_agents import shards
@@ -85,6 +82,46 @@ def test_the_same_rng_and_contents_draw_the_same_batch_again(tmp_path):
         np.testing.assert_array_equal(stream, tensors(two)[name])
 
 
+def test_width_and_generator_may_be_left_out(tmp_path):
+    dataset = made(tmp_path, chain(300, action_dim=2), chain(300, action_dim=5))
+    one, two = dataset.sample(32, 9), dataset.sample(32, 9)
+    assert one.action.shape == (32, 9, 5)
+    assert not one.image.equal(two.image)
+    assert dataset.subset([0]).sample(1, 9).action.shape == (1, 9, 2)
+
+
+def test_batches_come_from_pinned_memory_if_asked(tmp_path, monkeypatch):
+    pinned = []
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda t: pinned.append(t.shape) or t)
+    batches = made(tmp_path, chain(30)).batches(4, 9, 2, seed=0, ahead=0, pin=True)
+    check_chain(next(batches))
+    batches.close()
+    assert len(pinned) >= 6  # the streams of a Batch
+
+
+def test_a_batch_goes_to_another_device(tmp_path):
+    batch = made(tmp_path, chain(30)).sample(4, 9)
+    assert batch.to("meta").image.shape == batch.image.shape
+    assert {stream.device.type for stream in vars(batch.to("meta")).values()} == {"meta"}
+
+
+def test_threads_may_sample_windows_of_different_lengths(tmp_path):
+    dataset = made(tmp_path, *(chain(n, n) for n in (9, 20, 31)))
+    with ThreadPoolExecutor(4) as pool:
+        for batch in pool.map(lambda k: dataset.sample(8, 4 + k % 5, rng=rng(k)), range(60)):
+            check_chain(batch)
+
+
+def test_trajectories_shorter_than_a_window_are_chained_not_dropped(tmp_path):
+    dataset = made(tmp_path, chain(3), chain(4, 1), chain(40, 2))
+    batch = dataset.sample(200, 16, rng=rng())
+    check_chain(batch)
+    joints = batch.is_first.numpy()[:, 1:].any(1)
+    # 41 images have 26 windows of 16, each short trajectory counts as one
+    np.testing.assert_allclose(joints.mean(), 2 / 28, atol=0.06)
+    assert joints.any()
+
+
 def test_batch_k_depends_on_seed_rank_and_k_alone(tmp_path):
     dataset = made(tmp_path, chain(300))
 
@@ -94,15 +131,58 @@ def test_batch_k_depends_on_seed_rank_and_k_alone(tmp_path):
         batches.close()
         return found
 
-    assert starts(0, 3)[:2] == starts(0, 0)[3:]
+    drawn = [dataset.sample(4, 9, 2, rng([1, 0, k])).image[:, 0, 0, 0, 0].tolist() for k in (3, 4)]
+    assert starts(0, 3)[:2] == starts(0, 0)[3:] == drawn
     assert starts(0, 0) != starts(1, 0)
 
 
-def test_datasets_are_merged_by_extending_one(tmp_path):
-    one, other = made(tmp_path / "1", chain(9)), made(tmp_path / "2", chain(8), chain(7))
-    with one:
-        one.extend(other.subset([1]))
-    assert TrajectoryDataset.open(tmp_path / "1").lengths.tolist() == [9, 7]
+def test_what_was_appended_is_seen_by_the_one_who_appended(tmp_path):
+    with TrajectoryDataset.create(tmp_path, image_size=8) as dataset:
+        for seed in range(3):
+            dataset.append(chain(20, seed))
+            np.testing.assert_array_equal(dataset[seed].image, chain(20, seed).image)
+        assert len(dataset) == 3
+
+
+@pytest.mark.parametrize("codec", ["zstd", "raw"])
+def test_extending_copies_another_dataset_in_its_order(tmp_path, codec):
+    labels = {"terminated": True, "embodiment": "arm", "task": "reach", "source": "ours"}
+    other = made(tmp_path / "2", chain(8, 1), chain(40, 2, **labels), chain(7, reward=None))
+    with made(tmp_path / "1", chain(9), codec=codec) as dataset:
+        dataset.extend(other.subset([2, 1, 1]))
+        assert dataset.lengths.tolist() == [9, 7, 40, 40]
+    dataset = TrajectoryDataset.open(tmp_path / "1")
+    assert dataset.validate() == []
+    for new, old in zip(dataset, (chain(9), other[2], other[1], other[1]), strict=True):
+        for name, value in vars(old).items():
+            np.testing.assert_array_equal(getattr(new, name), value)
+
+
+def test_merge_makes_a_dataset_of_several(tmp_path):
+    parts = [made(tmp_path / str(n), chain(n), chain(n + 1)) for n in (3, 5)]
+    merged = TrajectoryDataset.merge(tmp_path / "all", [*parts, parts[0].subset([1])])
+    assert merged.lengths.tolist() == [3, 4, 5, 6, 4]
+    assert merged.validate() == []
+    with merged:
+        merged.append(chain(9))
+    assert [len(part) for part in parts] == [2, 2]
+
+
+def test_merge_refuses_nothing_and_other_sizes_before_it_writes(tmp_path):
+    small, large = made(tmp_path / "1", chain(3)), TrajectoryDataset.create(tmp_path / "2")
+    with pytest.raises(ValueError, match=r"one image size: .*1 has 8, .*2 has 64"):
+        TrajectoryDataset.merge(tmp_path / "all", [small, large])
+    with pytest.raises(ValueError, match="none given"):
+        TrajectoryDataset.merge(tmp_path / "all", [])
+    assert not (tmp_path / "all").exists()
+
+
+def test_a_damaged_trajectory_is_not_copied(tmp_path):
+    other = made(tmp_path / "1", chain(40), chain(40, 1))
+    flip_bit(tmp_path / "1" / "shard-00000.bin", other.info()["bytes"] - 20)
+    with pytest.raises(ValueError, match=f"Trajectory 1 of {tmp_path / '1'} is damaged"):
+        TrajectoryDataset.merge(tmp_path / "2", [other])
+    assert TrajectoryDataset.open(tmp_path / "2").lengths.tolist() == [40]
 
 
 def test_lengths_widths_and_labels(tmp_path):
@@ -148,6 +228,60 @@ def test_info_counts(tmp_path):
     assert info["compression"] > 2
 
 
+def test_sources_and_tasks_are_told_and_counted(tmp_path):
+    dataset = made(tmp_path, chain(4, source="ours", task="run"), chain(4, task="run"), chain(4))
+    assert dataset.sources == ["ours", None, None]
+    assert dataset.info()["tasks"] == {"run": 2, None: 1}
+
+
+def photograph(length, size=16):
+    """A trajectory whose images shade smoothly, with the noise of a camera."""
+    rng = np.random.default_rng(0)
+    shade = np.linspace(40, 200, size)[:, None] + np.linspace(-30, 30, size)
+    noisy = shade[None, :, :, None] + rng.normal(0, 4, (length + 1, size, size, 3))
+    return Trajectory(noisy.astype(np.uint8), chain(length).action, chain(length).reward)
+
+
+@pytest.mark.parametrize("length", [1, 15, 16, 40])
+def test_jpeg_keeps_images_nearly_and_all_else_exactly(tmp_path, length):
+    old = photograph(length)
+    with TrajectoryDataset.create(tmp_path, image_size=16, codec="jpeg") as dataset:
+        dataset.append(old)
+    new = TrajectoryDataset.open(tmp_path)[0]
+    assert np.abs(new.image.astype(int) - old.image).mean() < 3
+    np.testing.assert_array_equal(new.action, old.action)
+    np.testing.assert_array_equal(new.reward, old.reward)
+
+
+def test_info_says_what_a_codec_saves_and_whether_it_loses(tmp_path):
+    infos = {}
+    for codec in ("zstd", "raw", "jpeg"):
+        with TrajectoryDataset.create(tmp_path / codec, image_size=16, codec=codec) as dataset:
+            dataset.append(photograph(60))
+        infos[codec] = dataset.info()
+    assert infos["jpeg"]["compression"] > 1.5 * infos["zstd"]["compression"]
+    assert [infos[c]["lossless"] for c in ("zstd", "raw", "jpeg")] == [True, True, False]
+
+
+@pytest.mark.parametrize("size", [7, 9])
+def test_another_image_size_in_meta_json_is_found_at_reading(tmp_path, size):
+    made(tmp_path, chain(40))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps({**meta, "image_size": size}))
+    dataset = TrajectoryDataset.open(tmp_path)
+    with pytest.raises(ValueError, match=f"Trajectory 0 .* does not hold .* images of {size} x"):
+        dataset.sample(1, 4)
+    assert len(dataset.validate()) == 1
+
+
+def test_a_codec_of_a_newer_version_is_named(tmp_path):
+    made(tmp_path, chain(3))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps({**meta, "codec": "av1"}))
+    with pytest.raises(ValueError, match=r"No codec 'av1'.*There are: jpeg, raw, zstd"):
+        TrajectoryDataset.open(tmp_path)
+
+
 def test_the_default_codec_is_lossless_and_smaller_than_raw(tmp_path):
     small, raw = (made(tmp_path / c, chain(90), codec=c).info()["bytes"] for c in ("zstd", "raw"))
     assert small < raw / 2
@@ -166,7 +300,7 @@ def test_shards_roll_over_and_appending_goes_on_after_reopening(tmp_path, monkey
 
 
 def test_a_codec_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"No codec 'gif'\. There are: raw, zstd"):
+    with pytest.raises(ValueError, match=r"No codec 'gif'\. There are: jpeg, raw, zstd"):
         TrajectoryDataset.create(tmp_path, codec="gif")
 
 
@@ -253,6 +387,76 @@ def test_a_truncated_and_a_missing_shard_are_found(tmp_path, monkeypatch):
     os.truncate(tmp_path / "shard-00001.bin", 100)
     (tmp_path / "shard-00003.bin").unlink()
     assert [damage.trajectory for damage in dataset.validate()] == [1, 3]
+    for i in (1, 3):
+        with pytest.raises(ValueError, match=f"Trajectory {i} of {tmp_path} is damaged"):
+            dataset.subset([i]).sample(1, 41)
+
+
+def test_damaged_trajectories_are_set_aside_and_the_rest_is_usable(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "SHARD_BYTES", 10)  # a shard a trajectory
+    dataset = made(tmp_path, *(chain(20, seed) for seed in range(6)))
+    flip_bit(tmp_path / "shard-00001.bin", 30)
+    os.truncate(tmp_path / "shard-00005.bin", 50)
+    assert [d.trajectory for d in dataset.validate(set_aside=True)] == [1, 5]
+    assert (len(dataset), dataset.validate()) == (4, [])
+    check_chain(dataset.sample(16, 9))
+    dataset = TrajectoryDataset.open(tmp_path)
+    assert (dataset.info()["trajectories"], dataset.info()["set_aside"]) == (4, 2)
+    with dataset:
+        dataset.append(chain(20, 6))
+        assert len(dataset) == 5
+    kept = [chain(20, seed).image for seed in (0, 2, 3, 4, 6)]
+    np.testing.assert_array_equal([t.image for t in TrajectoryDataset.open(tmp_path)], kept)
+
+
+def test_a_second_damage_joins_the_first_and_a_repair_brings_both_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "SHARD_BYTES", 10)
+    made(tmp_path, *(chain(20, seed) for seed in range(4)))
+    for shard in ("shard-00000.bin", "shard-00002.bin"):
+        flip_bit(tmp_path / shard, 30)
+        dataset = TrajectoryDataset.open(tmp_path)
+        assert len(dataset.subset(range(len(dataset))).validate(set_aside=True)) == 1
+        flip_bit(tmp_path / shard, 30)
+    assert len(TrajectoryDataset.open(tmp_path)) == 2
+    (tmp_path / "damaged.json").unlink()
+    dataset = TrajectoryDataset.open(tmp_path)
+    assert (len(dataset), dataset.validate()) == (4, [])
+
+
+def test_the_writer_itself_can_set_aside_and_go_on(tmp_path):
+    with TrajectoryDataset.create(tmp_path, image_size=8) as dataset:
+        dataset.extend(chain(20, seed) for seed in range(2))
+        flip_bit(tmp_path / "shard-00000.bin", 30)
+        assert len(dataset.validate(set_aside=True)) == 1
+        dataset.append(chain(20, 2))
+        np.testing.assert_array_equal(dataset[1].image, chain(20, 2).image)
+    assert len(TrajectoryDataset.open(tmp_path)) == 2
+
+
+def test_validating_alone_sets_nothing_aside(tmp_path):
+    dataset = made(tmp_path, chain(20))
+    flip_bit(tmp_path / "shard-00000.bin", 30)
+    assert len(dataset.validate()) == 1
+    assert len(TrajectoryDataset.open(tmp_path)) == 1
+    assert not (tmp_path / "damaged.json").exists()
+
+
+@pytest.mark.parametrize("text", ["[{", "[1]", '[{"shard": 0}]'])
+def test_a_damaged_list_of_the_damaged_is_named_with_the_remedy(tmp_path, text):
+    made(tmp_path, chain(3))
+    (tmp_path / "damaged.json").write_text(text)
+    with pytest.raises(ValueError, match=r"damaged\.json is damaged .*; delete it"):
+        TrajectoryDataset.open(tmp_path)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 1, 2), (0, 2, 1), (1, 0, 2)])
+def test_lines_repeated_or_out_of_order_are_refused(tmp_path, order):
+    made(tmp_path, chain(3), chain(4), chain(5))
+    index = tmp_path / "index.jsonl"
+    lines = index.read_bytes().splitlines(keepends=True)
+    index.write_bytes(b"".join(lines[i] for i in order))
+    with pytest.raises(ValueError, match=r"line \d is a repetition or out of order; restore"):
+        TrajectoryDataset.open(tmp_path)
 
 
 def test_a_damaged_line_of_the_index_is_named_with_the_remedy(tmp_path):
@@ -286,26 +490,6 @@ def test_the_next_writer_removes_what_a_killed_one_left(tmp_path):
     assert dataset.lengths.tolist() == [20, 30]
     assert dataset.validate() == []
     assert (tmp_path / "shard-00000.bin").stat().st_size == dataset.info()["bytes"]
-
-
-def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, monkeypatch):
-    made(tmp_path, chain(20))
-    real, written = os.write, []
-
-    def full(descriptor, data):
-        if len(written) == 2:
-            raise OSError(28, "No space left on device")
-        written.append(real(descriptor, data[:7]))
-        return written[-1]
-
-    with TrajectoryDataset.open(tmp_path) as dataset:
-        monkeypatch.setattr("os.write", full)
-        with pytest.raises(OSError, match="No space"):
-            dataset.append(chain(90, 1))
-        monkeypatch.undo()
-        dataset.append(chain(30, 2))
-    dataset = TrajectoryDataset.open(tmp_path)
-    assert (dataset.lengths.tolist(), dataset.validate()) == ([20, 30], [])
 
 
 def test_a_second_writer_is_refused_until_the_first_is_done(tmp_path):
@@ -345,33 +529,3 @@ def test_a_fork_that_inherits_the_threads_can_sample(tmp_path):
     dataset._pool_owner = -1  # what a child sees: the threads belong to another process
     check_chain(dataset.sample(4, 9, 2, rng()))
     dataset.close()
-
-
-WRITER = """
-import sys
-sys.path.insert(0, {tests!r})
-from chain import chain
-from wpt_agents.dataset import TrajectoryDataset
-dataset = TrajectoryDataset.open({path!r})
-for seed in range(len(dataset), 1_000_000):
-    dataset.append(chain(200, seed, size=32))
-    print(seed + 1, flush=True)
-"""
-
-
-def test_a_killed_writer_loses_at_most_the_trajectory_being_written(tmp_path):
-    TrajectoryDataset.create(tmp_path, image_size=32).close()
-    script = WRITER.format(tests=str(Path(__file__).parent), path=str(tmp_path))
-    known = 0
-    for round_ in range(3):
-        with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as writer:
-            for _ in range(3):
-                known = int(writer.stdout.readline())
-            time.sleep(0.01 * round_)
-            writer.send_signal(signal.SIGKILL)
-            known = int([known, *writer.stdout.read().split(b"\n")[:-1]][-1])
-        dataset = TrajectoryDataset.open(tmp_path)
-        assert known <= len(dataset) <= known + 1
-        assert dataset.validate() == []
-    for seed, trajectory in enumerate(dataset):
-        np.testing.assert_array_equal(trajectory.action, chain(200, seed, size=32).action)

@@ -1,6 +1,7 @@
 """DMControl: rewards, seeds, episodes, and each custom reward on states set by hand."""
 
 import json
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -8,8 +9,21 @@ import numpy as np
 import pytest
 import wpt_envs  # noqa: F401
 from dm_control import suite
+from shimmy import DmControlCompatibilityV0
 from wpt_envs import tasks
 
+
+def stock_name(task):
+    """What dm_control calls it, if it has it."""
+    return task.name.removeprefix(f"{task.embodiment}-").replace("-", "_")
+
+
+def stock_names(domain):
+    return set(import_module(f"dm_control.suite.{domain}").SUITE)
+
+
+DMC = tasks.suite("dmc", paper_only=False)
+STOCK = [task for task in DMC if stock_name(task) in stock_names(task.embodiment)]
 REWARDS = json.loads((Path(__file__).parent / "data" / "dmc_rewards.json").read_text())
 
 
@@ -63,6 +77,24 @@ def test_a_seed_is_dm_controls_random_state_and_goes_on_without_one(domain):
         assert np.array_equal(ours.dm_env.physics.get_state(), theirs.physics.get_state())
 
 
+@pytest.mark.filterwarnings("ignore:`in1d`:DeprecationWarning")  # dm_control's, not ours
+@pytest.mark.parametrize("task", STOCK, ids=lambda task: task.name)
+def test_a_stock_task_is_the_same_through_shimmy(task):
+    theirs = DmControlCompatibilityV0(suite.load(task.embodiment, stock_name(task)))
+    ours = gym.make(task.id).unwrapped
+    theirs.reset(seed=5), ours.reset(seed=5)
+    for step in range(5):
+        action = np.sin(step + np.arange(task.action_dim)).astype(np.float32)
+        (obs, *rest), (state, *ends, _) = theirs.step(action), ours.step(action)
+        assert np.array_equal(np.concatenate([np.ravel(part) for part in obs.values()]), state)
+        assert rest[:3] == ends  # reward, terminated, truncated
+
+
+@pytest.mark.parametrize("domain", ["cartpole", "acrobot", "cheetah", "walker", "quadruped"])
+def test_every_stock_task_of_a_domain_is_in_the_table(domain):
+    assert stock_names(domain) == {stock_name(task) for task in STOCK if task.embodiment == domain}
+
+
 def test_the_constructors_seed_is_used_once():
     env = gym.make("wpt/dmc-acrobot-swingup-v0", seed=7).unwrapped
     first, second = env.reset()[0], env.reset()[0]
@@ -82,7 +114,7 @@ def test_an_episode_is_truncated_after_its_frames_and_never_terminated(name):
     assert ends == [(False, False)] * (task.frames - 1) + [(False, True)]
 
 
-@pytest.mark.parametrize("task", tasks.suite("dmc", paper_only=False), ids=lambda task: task.name)
+@pytest.mark.parametrize("task", DMC, ids=lambda task: task.name)
 def test_the_table_has_the_simulators_width(task):
     env = gym.make(task.id).unwrapped
     assert env.dm_env.action_spec().shape == (task.action_dim,)

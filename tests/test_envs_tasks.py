@@ -1,5 +1,6 @@
 """The table of tasks, and what importing the package does."""
 
+import re
 import subprocess
 import sys
 
@@ -7,6 +8,8 @@ import gymnasium as gym
 import pytest
 import wpt_envs
 from wpt_envs import tasks
+
+from wpt_agents.zoo import __main__ as command_line
 
 IMPORT = """
 import sys, wpt_envs
@@ -47,6 +50,24 @@ def test_a_suites_width_is_that_of_its_widest_embodiment():
 def test_an_unknown_task_is_answered_with_the_nearest_names():
     with pytest.raises(ValueError, match="walker-run"):
         tasks.find("dmc", "walker-rum")
+
+
+def test_an_unknown_id_is_answered_with_the_nearest():
+    with pytest.raises(gym.error.NameNotFound, match="dmc-walker-run"):
+        gym.make("wpt/dmc-walker-rum-v0")
+
+
+def test_the_zoo_prints_the_table(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr(sys, "argv", ["zoo", "list"])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    told = {tuple(re.findall(r"[\w-]+", line)) for line in capsys.readouterr().out.splitlines()}
+    for row in wpt_envs.TASKS.values():
+        numbers = str(row.action_dim), str(row.frames)
+        paper = "yes" if row.in_paper else "no"
+        name = f"{row.suite}-{row.name}"
+        assert (name, row.embodiment, *numbers, row.metric, paper) in told
 
 
 def test_an_unknown_suite_is_answered_with_all_suites():

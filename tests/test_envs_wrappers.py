@@ -1,6 +1,7 @@
 """The wrappers, pixels() around any environment, and the checkers on every task."""
 
 import hashlib
+import pickle
 import subprocess
 import sys
 
@@ -8,10 +9,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import wpt_envs
+from dm_control.rl.control import PhysicsError
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from wpt_envs.wrappers import CheckAction, PadAction, RepeatAction, SeePixels
+
+SUITES = ["dmc-walker-run", "metaworld-button-press", "robotics-fetch-push"]
+FAMILIES = [
+    *SUITES,
+    "dmc-cartpole-balance",
+    "dmc-acrobot-swingup",
+    "dmc-cheetah-run",
+    "dmc-quadruped-run",
+    "robotics-shadow-hand-block",
+    "robotics-adroit-door",
+]
 
 
 class Count(gym.Env):
@@ -41,16 +54,18 @@ class Count(gym.Env):
         return np.full((30, 40, 3), 10 * self.count, np.uint8)
 
 
-def episode_hash(name):
-    """A digest of everything that five steps bring."""
-    env = gym.make(name, rendering="fast", state_in_info=True)
-    digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
-    for step in range(5):
-        action = np.sin(step + np.arange(env.action_space.shape[0])).astype(np.float32)
-        obs, reward, *_, info = env.step(action)
-        digest.update(obs.tobytes() + np.float64(reward).tobytes() + info["state"].tobytes())
+def episode_hashes(name, seeds=(3, 4, 3)):
+    """For each seed a digest of everything that three steps bring, all from one environment."""
+    env = gym.make(f"wpt/{name}-v0", rendering="fast", state_in_info=True)
+    hashes = []
+    for seed in seeds:
+        results = [env.reset(seed=seed)]
+        for step in range(3):
+            action = np.sin(step + np.arange(env.action_space.shape[0])).astype(np.float32)
+            results.append(env.step(action))
+        hashes.append(hashlib.sha256(pickle.dumps(results)).hexdigest())
     env.close()
-    return digest.hexdigest()
+    return hashes
 
 
 def test_repeating_sums_rewards_and_stops_at_the_end():
@@ -62,9 +77,10 @@ def test_repeating_sums_rewards_and_stops_at_the_end():
     assert env.metadata["render_fps"] == 15
 
 
-def test_repeating_less_than_once_is_refused():
-    with pytest.raises(ValueError, match="1 or more"):
-        RepeatAction(Count(), times=0)
+@pytest.mark.parametrize("times", [0, -2, 1.5])
+def test_repeating_less_than_once_or_in_part_is_refused(times):
+    with pytest.raises(ValueError, match="whole number, 1 or more"):
+        RepeatAction(Count(), times=times)
 
 
 def test_padding_hands_the_leading_actions_on():
@@ -154,17 +170,21 @@ def test_rendering_answers_the_last_observation():
     assert np.array_equal(env.render(), obs)
 
 
-@pytest.mark.parametrize("name", ["wpt/dmc-walker-run-v0", "wpt/metaworld-button-press-v0"])
-def test_a_fresh_process_has_the_same_episode(name):
-    code = f"from test_envs_wrappers import episode_hash; print(episode_hash({name!r}))"
+def test_the_same_seed_is_the_same_episode_here_and_in_a_fresh_process_and_others_differ():
+    code = f"from test_envs_wrappers import *; print([*map(episode_hashes, {FAMILIES!r})])"
     run = [sys.executable, "-c", code]
     here = __file__.rpartition("/")[0]
     answer = subprocess.run(run, check=True, capture_output=True, text=True, cwd=here)
-    assert answer.stdout.split()[-1] == episode_hash(name)
+    hashes = [episode_hashes(name) for name in FAMILIES]
+    assert str(hashes) == answer.stdout.splitlines()[-1]
+    for first, other, again in hashes:
+        assert first == again and first != other
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("name", ["wpt/dmc-cheetah-run-v0", "wpt/metaworld-push-v0"])
+@pytest.mark.parametrize(
+    "name", ["wpt/dmc-cheetah-run-v0", "wpt/metaworld-push-v0", "wpt/robotics-fetch-push-v0"]
+)
 def test_a_forked_worker_has_the_same_episode_though_this_process_draws_too(name):
     env = gym.make(name, rendering="fast")
     first, _ = env.reset(seed=1)
@@ -175,6 +195,62 @@ def test_a_forked_worker_has_the_same_episode_though_this_process_draws_too(name
     vector.close()
     assert np.array_equal(firsts[1], first) and not np.array_equal(firsts[0], first)
     assert np.array_equal(steps[0][1], step[0]) and steps[1][1] == step[1]
+
+
+def test_a_spawned_worker_knows_the_ids_too():
+    name, spawned = "wpt/dmc-cartpole-balance-v0", {"context": "spawn"}
+    vector = gym.make_vec(name, 1, "async", vector_kwargs=spawned, rendering="fast")
+    first, _ = vector.reset(seed=0)
+    vector.close()
+    assert np.array_equal(first[0], gym.make(name, rendering="fast").reset(seed=0)[0])
+
+
+def test_make_vec_takes_the_keywords_too():
+    looks = {"image_size": 32, "rendering": "fast", "camera": "back", "render_size": 48}
+    acts = {"action_repeat": 4, "pad_action_to": "suite", "state_in_info": True, "seed": 3}
+    vector = gym.make_vec("wpt/dmc-walker-run-v0", num_envs=2, **looks, **acts)
+    assert vector.single_action_space.shape == (12,)
+    first, _ = vector.reset()
+    obs, _, _, _, info = vector.step(np.zeros((2, 12), np.float32))
+    assert obs.shape == (2, 32, 32, 3) and info["state"].shape == (2, 24)
+    assert vector.render()[0].shape == (48, 48, 3)
+    times = [env.unwrapped.dm_env.physics.time() for env in vector.envs]
+    assert times == pytest.approx([0.1, 0.1])  # four control steps
+    assert np.array_equal(vector.reset(seed=[3, 4])[0][0], first[0])
+    vector.close()
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_an_environment_that_raised_can_be_reset(name):
+    env = gym.make(f"wpt/{name}-v0", rendering="fast")
+    first, _ = env.reset(seed=1)
+    for bad in (np.nan, 7):
+        with pytest.raises(ValueError, match=r"NaN|outside"):
+            env.step(np.full(env.action_space.shape, bad, np.float32))
+    assert np.array_equal(env.reset(seed=1)[0], first)
+
+
+def test_a_simulation_that_broke_down_can_be_reset():
+    env = gym.make("wpt/dmc-walker-run-v0", rendering="fast")
+    first, _ = env.reset(seed=1)
+    env.unwrapped.dm_env.physics.data.qvel[:] = np.nan
+    with pytest.raises(PhysicsError):
+        env.step(np.zeros(6, np.float32))
+    assert np.array_equal(env.reset(seed=1)[0], first)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "complaint"),
+    [
+        ({"image_size": 0}, "image_size=0.*1 or more"),
+        ({"render_size": -1}, "render_size=-1.*1 or more"),
+        ({"pad_action_to": 4.5}, "a number, 'suite' or None"),
+        ({"render_mode": "human"}, "'rgb_array', None"),
+    ],
+)
+def test_a_bad_keyword_is_answered_with_what_would_do(keywords, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        gym.make("wpt/dmc-walker-run-v0", **keywords)
 
 
 WRAPPED = "ignore:.*is different from the unwrapped version"  # the pixels are wrappers, by design

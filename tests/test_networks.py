@@ -8,6 +8,7 @@ from wpt_agents.networks import (
     ChannelNorm,
     Decoder,
     Encoder,
+    FromPixel,
     Head,
     UpConv,
     frozen,
@@ -22,10 +23,12 @@ def noise(*shape, seed=0, dtype=torch.float32):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
-@pytest.mark.parametrize("kernel", [5, 6])
-@pytest.mark.parametrize("width", [1, 4, 13])
-def test_upconv_is_the_transposed_convolution_gradients_too(kernel, width):
-    ours = UpConv(3, 2, kernel).double()
+@pytest.mark.parametrize(
+    ("layer", "kernel", "width"),
+    [(FromPixel, 5, 1), *((UpConv, kernel, width) for kernel in (5, 6) for width in (1, 4, 13))],
+)
+def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, width):
+    ours = layer(3, 2, kernel).double()
     x = noise(2, 3, width, width, dtype=torch.float64).requires_grad_()
     plain = torch.nn.functional.conv_transpose2d(x, ours.weight, ours.bias, stride=2)
     result, leaves = ours(x), (x, ours.weight, ours.bias)
@@ -74,6 +77,22 @@ def test_the_encoder_takes_any_leading_axes():
     image = torch.randint(256, (2, 3, 64, 64, 3), dtype=torch.uint8)
     torch.testing.assert_close(encoder(image)[1, 2], encoder(image[1, 2][None])[0])
     assert encoder(image).shape == (2, 3, encoder.embed_dim)
+
+
+@pytest.mark.parametrize("part", ["encoder", "decoder"])
+def test_image_layers_in_pieces_are_those_of_all_images_at_once(part, monkeypatch):
+    torch.manual_seed(0)
+    image = torch.randint(256, (7, 64, 64, 3), dtype=torch.uint8)
+    net = Encoder(4) if part == "encoder" else Decoder(DEBUG)
+    inputs = (image,) if part == "encoder" else (noise(7, 64), noise(7, 8, 8, seed=1))
+    outputs, gradients = [], []
+    for rows in (7, 3):  # a split leaves one row over
+        monkeypatch.setattr("wpt_agents.networks.PIECE", rows * 32 * 32 * 12)
+        outputs.append(net(*inputs))
+        total = (outputs[-1] * noise(*outputs[-1].shape, seed=2)).sum()
+        gradients.append(torch.autograd.grad(total, list(net.parameters())))
+    torch.testing.assert_close(*outputs)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
 
 
 def test_the_decoder_makes_images_and_depends_on_both_parts():

@@ -153,6 +153,15 @@ def test_rewards_on_an_episode_never_trained_on_are_compared(capsys):
     )
 
 
+def test_a_dataset_is_made_and_used_as_its_page_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exec(blocks(PAGES["data.md"])[0], left := {})
+    assert capsys.readouterr().out.endswith(" []\n")
+    assert left["batch"].image.shape == (16, 64, 64, 64, 3)
+    assert left["both"].lengths.tolist() == [100, 100]
+    left["dataset"].close()
+
+
 def test_the_model_file_opens_with_other_peoples_readers(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agent().save("walker.zip")

@@ -257,3 +257,12 @@ def test_a_model_saved_on_one_device_loads_on_another(tmp_path):
     loaded = WPT.load(tmp_path / "model", device="auto")
     expected = "cuda" if torch.cuda.is_available() else "cpu"
     assert loaded.device.type == expected and SETTINGS["device"] == "cpu"
+
+
+def test_a_file_without_a_counter_is_refused_by_name(learnt, tmp_path):
+    learnt.save(tmp_path / "model")
+    about, tensors = read_model(tmp_path / "model.zip")
+    del about["counters"]["credit"], about["groups"]
+    write_model(tmp_path / "old.zip", about, tensors)
+    with pytest.raises(ValueError, match="lacks credit: it was written by an earlier"):
+        WPT.load(tmp_path / "old.zip")

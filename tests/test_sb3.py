@@ -84,6 +84,28 @@ def test_it_learns_in_a_subproc_vec_env(n):
     assert len(model.replay_buffer.trajectories) == 2 * n and 0 < mean < LENGTH
 
 
+def test_a_worker_that_dies_is_told_and_learning_goes_on_in_new_ones():
+    env = SubprocVecEnv([DotEnv] * 2)  # forked workers would hold each other's pipes open: no end
+    model, killer = agent(env), KillWorker(env.processes[1], step=2 * LENGTH + 10)
+    with pytest.raises(RuntimeError, match=r"worker process.*died.*set_env"):
+        model.learn(8 * LENGTH, callback=killer)
+    assert len(model.replay_buffer.trajectories) == 2
+    model.set_env(clocks(2))
+    assert model.learn(14, reset_num_timesteps=False).episodes == 4
+
+
+class KillWorker(BaseCallback):
+    def __init__(self, process, step):
+        super().__init__()
+        self.process, self.step = process, step
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            self.process.kill()
+            self.process.join()
+        return True
+
+
 def test_another_number_of_environments_is_taken_midway():
     model = agent(clocks(2)).learn(20)
     model.set_env(clocks(3))

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-import torch
 from chain import chain, check_chain
 
-from wpt_agents.trajectory import Batch, Trajectory, led_to, stack_windows
+from wpt_agents.trajectory import Trajectory, led_to, stack_windows
 
 IMAGE = np.zeros((4, 8, 8, 3), np.uint8)
 ACTION = np.zeros((3, 2), np.float32)
@@ -53,13 +52,6 @@ def test_whatever_the_padding_holds_becomes_zero():
 
 def test_stacked_windows_keep_to_the_chain():
     check_chain(stack_windows([led_to(chain(9, seed), seed, seed + 5, 3) for seed in range(4)]))
-
-
-def test_batches_join_along_b():
-    batch = stack_windows([led_to(chain(9), 0, 5, 2)])
-    joined = Batch.cat([batch, batch.to("cpu")])
-    assert joined.image.shape == (2, 5, 8, 8, 3)
-    assert torch.equal(joined.action[0], joined.action[1])
 
 
 @pytest.mark.parametrize(

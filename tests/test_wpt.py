@@ -1,6 +1,7 @@
 """Algorithm 1 from end to end, and each of its stages on its own."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -197,12 +198,28 @@ def test_an_index_of_another_encoder_is_refused(store):
 def test_a_subset_has_an_index_of_its_own(store):
     model = pretrained(store)
     model.build_index()
-    for ids in ([0, 1], [2, 3]):
+    for ids in ([0, 1], [2, 3], [5, 4, 3, 2, 1, 0], [0, 0, 1, 2, 3, 4]):
         model.set_dataset(store.subset(ids))
         first = next(store.subset(ids).first_observations())
-        np.testing.assert_array_equal(model.build_index().features, model.embed(first))
+        np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
     model.set_dataset(store)
-    assert len(model.build_index()) == 6
+    whole = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(whole))
+
+
+def test_an_index_of_other_trajectories_is_built_anew(store):
+    model = pretrained(store)
+    model.build_index()
+    size = (store.path / "shard-00000.bin").stat().st_size
+    content = bytearray((store.path / "shard-00000.bin").read_bytes())
+    content[size - 10] ^= 1
+    (store.path / "shard-00000.bin").write_bytes(content)
+    store.validate(set_aside=True)
+    with store:
+        store.append(recorded(seed=9))  # as many as before
+    assert len(store) == 6
+    first = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
 
 
 def test_an_index_that_cannot_be_written_is_kept_in_memory(store, monkeypatch):
@@ -383,3 +400,33 @@ def test_open_loop_shows_the_context_and_then_a_dream(store):
 def test_the_forward_passes_can_run_in_bfloat16(store):
     model = pretrained(store, env=DotEnv(), precision="bf16").learn(2 * LENGTH)
     assert all(torch.isfinite(v).all() for v in weights(model).values())
+
+
+def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_reward(monkeypatch):
+    model, episode = agent(ClockEnv()), recorded(length=6)
+    episode = replace(episode, reward=np.arange(6, dtype=np.float32))
+    grey, three = (
+        (lambda state: torch.zeros(1, 7, 64, 64, 3)),
+        (lambda feat: torch.full((1, 7), 3.0)),
+    )
+    monkeypatch.setattr(
+        model.policy.world_model, "decode", grey
+    )  # 0 is the middle of black and white
+    monkeypatch.setattr(model.policy.world_model, "reward", three)
+    errors = model.policy.heldout_errors(episode)
+    by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()
+    assert errors["reconstruction"] == pytest.approx(by_hand, rel=1e-4)
+    assert errors["reward"] == pytest.approx(np.mean([3, 2, 1, 0, 1, 2]))
+    assert len(errors) == 2
+
+
+def test_every_episode_is_judged_before_it_is_replayed(monkeypatch):
+    model, seen = agent(ClockEnv()), []
+    judge = model.policy.heldout_errors
+    monkeypatch.setattr(
+        model.policy,
+        "heldout_errors",
+        lambda t: seen.append(len(model.replay_buffer.trajectories)) or judge(t),
+    )
+    model.learn(21)
+    assert seen == [0, 1, 2]

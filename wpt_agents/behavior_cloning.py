@@ -1,9 +1,13 @@
 """The prior actor: a behaviour clone of the retrieved trajectories (A.3, Algorithm 1)."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
 from wpt_agents.networks import Encoder, LinearNorm, Size
+from wpt_agents.trajectory import Trajectory
 
 FRAMES = 3  # what one image does not show, such as velocities, three do
 
@@ -17,6 +21,28 @@ def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
     """
     assert prediction.shape == action.shape, (prediction.shape, action.shape)
     return ((prediction - action).square() * mask).sum() / (mask.sum() * len(action))
+
+
+def draw_pairs(
+    trajectories: Sequence[Trajectory], n: int, action_dim: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draws n of all trajectories' steps: what was seen, and the action that was then taken.
+
+    Before an episode's third image its first one stands for those that are missing, as in acting.
+
+    :return: images (n, F, 64, 64, 3) uint8, oldest first, and actions (n, A), padded with zeros
+    """
+    ends = np.cumsum([len(trajectory) for trajectory in trajectories])
+    draws = rng.integers(ends[-1], size=n)
+    chosen = np.searchsorted(ends, draws, side="right")
+    steps = draws - np.concatenate([[0], ends])[chosen]
+    times = np.maximum(steps[:, None] + np.arange(1 - FRAMES, 1), 0)
+    image = np.stack([trajectories[i].image[t] for i, t in zip(chosen, times, strict=True)])
+    action = np.zeros((n, action_dim), np.float32)
+    for row, i, t in zip(action, chosen, steps, strict=True):
+        taken = trajectories[i].action[t]
+        row[: len(taken)] = taken
+    return torch.from_numpy(image), torch.from_numpy(action)
 
 
 def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:

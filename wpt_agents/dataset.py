@@ -5,9 +5,10 @@ Example::
     with TrajectoryDataset.create("walker") as dataset:
         dataset.append(Trajectory(image, action, embodiment="walker"))
     dataset = TrajectoryDataset.open("walker")
-    batch = dataset.sample(16, 64, action_width=12, rng=np.random.default_rng(0))
+    batch = dataset.sample(16, 64)
 """
 
+import hashlib
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,16 +19,18 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from wpt_agents.shards import (
-    BLOCK,
+from wpt_agents.codecs import find_codec
+from wpt_agents.index import (
     Entry,
     Meta,
-    Writer,
+    add_damaged,
     create_folder,
+    read_damaged,
     read_index,
     read_meta,
-    read_steps,
+    undamaged,
 )
+from wpt_agents.shards import BLOCK, Writer, read_steps
 from wpt_agents.trajectory import IMAGE_SIZE, Batch, Trajectory
 from wpt_agents.windows import Piece, Windows, make_batch
 
@@ -83,27 +86,52 @@ class TrajectoryDataset:
     ) -> "TrajectoryDataset":
         """Makes an empty dataset in a new or empty folder.
 
-        :param codec: "zstd" (lossless, about a fifth) or "raw"
+        :param codec: "zstd" (lossless, a tenth to a fifth of simulated images), "raw" or "jpeg"
+            (lossy, quality 95: a fourth of noisy camera images, of which zstd makes little)
+        :raises ValueError: an unknown codec, or a folder with something in it
         """
+        find_codec(codec)
         create_folder(Path(path), Meta(image_size, codec))
         return cls.open(path, workers)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], workers: int = 0) -> "TrajectoryDataset":
-        """Opens a dataset, reading its index only.
+        """Opens a dataset, reading its index only, without the trajectories set aside.
 
         :raises ValueError: no dataset there, one of a newer version, or a damaged index
         """
         path = Path(path)
-        return cls(path, read_meta(path), read_index(path)[0], workers=workers)
+        meta = read_meta(path)
+        find_codec(meta.codec)
+        return cls(path, meta, undamaged(path, read_index(path)[0]), workers=workers)
+
+    @classmethod
+    def merge(
+        cls,
+        path: str | os.PathLike[str],
+        datasets: Sequence["TrajectoryDataset"],
+        workers: int = 0,
+    ) -> "TrajectoryDataset":
+        """Makes a new dataset of all trajectories of `datasets`, in their order.
+
+        :raises ValueError: no datasets, images of different sizes, a folder with something in it,
+            or a damaged trajectory; those before it are kept
+        """
+        metas = {dataset._meta: dataset.path for dataset in datasets}
+        if len({meta.image_size for meta in metas}) != 1:
+            found = ", ".join(f"{path} has {meta.image_size}" for meta, path in metas.items())
+            raise ValueError(f"merge wants datasets of one image size: {found or 'none given'}")
+        meta = next(iter(metas))
+        with cls.create(path, meta.image_size, meta.codec) as merged:
+            for dataset in datasets:
+                merged.extend(dataset)
+        return cls.open(path, workers)
 
     def append(self, trajectory: Trajectory) -> None:
         """Adds a trajectory at the end. Once this returns, readers who open the folder see it.
 
         :raises ValueError: another image size, non-zero padding, a subset, or another writer
         """
-        if self._ids is not None:
-            raise ValueError("A subset is read-only; append to the dataset it was taken from")
         size = self._meta.image_size
         if trajectory.image.shape[1:3] != (size, size):
             raise ValueError(
@@ -116,16 +144,39 @@ class TrajectoryDataset:
                 f"Actions past action_dim={trajectory.action_dim} must be zero; "
                 f"give the true action_dim, of at most {trajectory.action.shape[1]}"
             )
-        if self._writer is None:
-            self._writer = Writer(self.path, self._meta)
-            self._entries = self._writer.entries
-        self._writer.append(trajectory)
+        entry = self._begin().append(trajectory)  # which may replace the list of entries
+        self._entries.append(entry)
         self._windows = None
 
     def extend(self, trajectories: Iterable[Trajectory]) -> None:
-        """Adds trajectories one by one, another dataset's for example; what is added stays."""
-        for trajectory in trajectories:
-            self.append(trajectory)
+        """Adds trajectories one by one; what is added stays.
+
+        Those of another dataset with the same codec are copied as they are stored, checked but not
+        decoded.
+        """
+        if isinstance(trajectories, TrajectoryDataset) and trajectories._meta == self._meta:
+            trajectories._copy_to(self)
+        else:
+            for trajectory in trajectories:
+                self.append(trajectory)
+
+    def _copy_to(self, other: "TrajectoryDataset") -> None:
+        writer = other._begin()
+        for i, entry in enumerate(list(self._entries)):
+            try:
+                other._entries.append(writer.copy(self.path, entry))
+            except OSError as error:
+                raise self._damaged(i, error) from error
+        other._windows = None
+
+    def _begin(self) -> Writer:
+        """The right to write, taken at the first append; what others appended is seen then."""
+        if self.is_subset:
+            raise ValueError("A subset is read-only; append to the dataset it was taken from")
+        if self._writer is None:
+            self._writer = Writer(self.path, self._meta)
+            self._entries = self._writer.entries
+        return self._writer
 
     def flush(self) -> None:
         """Makes what was appended survive a power cut; a killed process loses nothing anyway."""
@@ -136,7 +187,7 @@ class TrajectoryDataset:
         """Ends the appending and the threads; the dataset can still be read."""
         if self._writer is not None:
             self._writer.close()
-            self._entries, self._writer = list(self._entries), None
+            self._writer = None
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
@@ -184,6 +235,11 @@ class TrajectoryDataset:
         return [entry.task for entry in self._entries]
 
     @property
+    def sources(self) -> list[str | None]:
+        """Where each trajectory comes from, None where unknown."""
+        return [entry.source for entry in self._entries]
+
+    @property
     def max_action_dim(self) -> int:
         """The widest embodiment's action width, 0 without trajectories."""
         return max((entry.action_dim for entry in self._entries), default=0)
@@ -192,6 +248,19 @@ class TrajectoryDataset:
     def image_size(self) -> int:
         """Height and width of the images."""
         return self._meta.image_size
+
+    @property
+    def is_subset(self) -> bool:
+        """Whether this is a view made by `subset`, be it of all trajectories in another order."""
+        return self._ids is not None
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of which trajectories these are, in which order; an index keeps its dataset's."""
+        digest = hashlib.sha256()
+        for e in self._entries:
+            digest.update(f"{e.shard} {e.at} {e.length} {e.blocks}\n".encode())
+        return digest.hexdigest()
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> "TrajectoryDataset":
         """A read-only view of some trajectories, in the order given."""
@@ -209,10 +278,16 @@ class TrajectoryDataset:
         return self._read((i, 0, 1))[0].image[0].copy()  # a view would keep its block
 
     def sample(
-        self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
+        self,
+        batch_size: int,
+        length: int,
+        action_width: int | None = None,
+        rng: np.random.Generator | None = None,
     ) -> Batch:
         """Windows drawn by the rule of `wpt_agents.windows`; nothing but `rng` decides which.
 
+        :param action_width: how wide the batch's actions are; `max_action_dim` when not given
+        :param rng: other windows at every call when not given
         :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
             `action_width`
         """
@@ -220,7 +295,8 @@ class TrajectoryDataset:
             raise ValueError(f"{self.path} holds no trajectory; append some before sampling")
         if self._windows is None:
             self._windows = Windows(self.lengths)
-        rows = self._windows.draw(batch_size, length, rng)
+        rows = self._windows.draw(batch_size, length, rng or np.random.default_rng())
+        action_width = self.max_action_dim if action_width is None else action_width
         shape = (self.image_size, self.image_size, 3)
         return make_batch(rows, self._read, shape, action_width, self._each)
 
@@ -233,15 +309,18 @@ class TrajectoryDataset:
         rank: int = 0,
         start: int = 0,
         ahead: int = 2,
+        pin: bool = False,
     ) -> Iterator[Batch]:
         """Batches without end, from number `start`; batch k depends on (seed, rank, k) alone.
 
         :param ahead: how many are prepared in the background
+        :param pin: put them into pinned memory, from which a GPU copies while it computes
         """
 
         def draw(k: int) -> Batch:
-            rng = np.random.default_rng(np.random.SeedSequence([seed, rank, k]))
-            return self.sample(batch_size, length, action_width, rng)
+            rng = np.random.default_rng([seed, rank, k])
+            batch = self.sample(batch_size, length, action_width, rng)
+            return batch.pin() if pin else batch
 
         with ThreadPoolExecutor(1, "batches") as pool:
             waiting = deque(pool.submit(draw, k) for k in range(start, start + ahead + 1))
@@ -253,8 +332,11 @@ class TrajectoryDataset:
                 pool.shutdown(cancel_futures=True)
 
     def info(self) -> dict[str, Any]:
-        """Counts, widths, lengths and how many bytes an image takes."""
-        stored = sum(entry.size for entry in self._entries)
+        """Counts, widths, lengths and how many bytes an image takes.
+
+        `compression` is the ratio of the images' own size to what is stored, actions included.
+        """
+        stored = sum(sum(entry.sizes) for entry in self._entries)
         images = int(self.lengths.sum()) + len(self)
         return {
             "path": str(self.path),
@@ -263,16 +345,24 @@ class TrajectoryDataset:
             "lengths": [int(self.lengths.min()), int(self.lengths.max())] if len(self) else [],
             "embodiments": dict(Counter(self.embodiments)),
             "action_dims": {int(k): n for k, n in Counter(self.action_dims).items()},
+            "tasks": dict(Counter(self.tasks)),
             "with_reward": sum(entry.reward for entry in self._entries),
+            "set_aside": len(read_damaged(self.path)),
             "image_size": self.image_size,
             "codec": self._meta.codec,
+            "lossless": find_codec(self._meta.codec).lossless,
             "bytes": stored,
             "bytes_per_image": stored / images if images else 0.0,
             "compression": images * self.image_size**2 * 3 / stored if images else 1.0,
         }
 
-    def validate(self, progress_bar: bool = False) -> list[Damage]:
-        """Reads every byte and names the trajectories that are damaged; [] if all is well."""
+    def validate(self, progress_bar: bool = False, set_aside: bool = False) -> list[Damage]:
+        """Reads every byte and names the trajectories that are damaged; [] if all is well.
+
+        :param set_aside: leave the damaged ones out, here and for all who open the folder from now
+            on; those behind them move up. The folder's damaged.json lists them; without that file
+            they are back
+        """
         from tqdm.auto import tqdm
 
         damaged = []
@@ -281,7 +371,16 @@ class TrajectoryDataset:
                 for damage in self._each(self._damage, range(at, min(at + 256, len(self)))):
                     damaged += [damage] if damage is not None else []
                     bar.update()
+        if set_aside and damaged:
+            add_damaged(self.path, {self._entries[d.trajectory].place: d.reason for d in damaged})
+            self._leave_out({d.trajectory for d in damaged})
         return damaged
+
+    def _leave_out(self, gone: set[int]) -> None:
+        keep = [i for i in range(len(self)) if i not in gone]
+        self._entries = [self._entries[i] for i in keep]
+        self._ids = None if self._ids is None else [self._ids[i] for i in keep]
+        self._windows = None
 
     def _damage(self, i: int) -> Damage | None:
         try:
@@ -308,10 +407,7 @@ class TrajectoryDataset:
         try:
             image, action, reward = read_steps(self.path, self._meta, entry, first, last)
         except OSError as error:
-            raise ValueError(
-                f"Trajectory {self._id(i)} of {self.path} is damaged: {error}. `validate` lists "
-                "all that are; leave them out with `subset`"
-            ) from error
+            raise self._damaged(i, error) from error
         start, stop = start - first * BLOCK, stop - first * BLOCK
         part = _Part(
             image=image[:stop],
@@ -324,3 +420,9 @@ class TrajectoryDataset:
             source=entry.source,
         )
         return part, start, stop
+
+    def _damaged(self, i: int, error: OSError) -> ValueError:
+        return ValueError(
+            f"Trajectory {self._id(i)} of {self.path} is damaged: {error}. `validate` lists all "
+            "that are, `validate(set_aside=True)` leaves them out"
+        )

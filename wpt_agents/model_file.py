@@ -37,12 +37,13 @@ def write_model(
 def _write(
     file: BinaryIO, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
+    # ZipInfo has no time of day in it: equal models are equal bytes
     with zipfile.ZipFile(file, "w") as archive:
         head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **about}
-        archive.writestr(ABOUT, json.dumps(head, indent=1))
+        archive.writestr(zipfile.ZipInfo(ABOUT), json.dumps(head, indent=1))
         for name, group in tensors.items():
             whole = {key: tensor.detach().cpu().contiguous() for key, tensor in group.items()}
-            archive.writestr(name + TENSORS, save_tensors(whole))
+            archive.writestr(zipfile.ZipInfo(name + TENSORS), save_tensors(whole))
 
 
 def read_model(

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 NORM_EPS = 1e-3
+PIECE = 2**22  # numbers in the largest tensor that a stack of image layers makes on a CPU, 16 MB
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ class Encoder(nn.Module):
         """(..., 64, 64, channels_in) uint8 -> (..., E)."""
         assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
         x = to_unit(image).flatten(0, -4).permute(0, 3, 1, 2)  # channels_last in memory
-        return self.layers(x).flatten(1).unflatten(0, image.shape[:-3])
+        x = in_pieces(self.layers, x, 31 * 31 * self.layers[0].out_channels)
+        return x.flatten(1).unflatten(0, image.shape[:-3])
 
 
 class UpConv(nn.ConvTranspose2d):
@@ -136,12 +138,24 @@ class UpConv(nn.ConvTranspose2d):
         return out.permute(0, 3, 1, 2)
 
 
+class FromPixel(nn.ConvTranspose2d):
+    """A transposed convolution of a single pixel, computed as the matrix product that it is."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, 1, 1) -> (N, outputs, K, K), channels last in memory."""
+        assert x.shape[-2:] == (1, 1), x.shape
+        weight = self.weight.permute(0, 2, 3, 1)  # (inputs, K, K, outputs)
+        out = (x.flatten(1) @ weight.flatten(1)).unflatten(1, weight.shape[1:]) + self.bias
+        return out.permute(0, 3, 1, 2)
+
+
 class Decoder(nn.Module):
     """The mean of p(o | h, z): two MLPs summed, then 1 > 5 > 13 > 30 > 64; no squashing."""
 
     def __init__(self, size: Size) -> None:
         super().__init__()
         width, code, depth = 2 * size.hidden, 32 * size.depth, size.depth
+        self.depth = depth
         self.from_deter = nn.Sequential(
             BlockLinear(size.deter, width, size.blocks),
             nn.LayerNorm(width, eps=NORM_EPS),
@@ -152,7 +166,7 @@ class Decoder(nn.Module):
             LinearNorm(size.stoch * size.classes, width), nn.Linear(width, code)
         )
         self.layers = nn.Sequential(
-            nn.ConvTranspose2d(code, 4 * depth, 5, 2),
+            FromPixel(code, 4 * depth, 5),
             ChannelNorm(4 * depth),
             nn.SiLU(),
             nn.ConvTranspose2d(4 * depth, 2 * depth, 5, 2),
@@ -167,7 +181,8 @@ class Decoder(nn.Module):
     def forward(self, deter: Tensor, stoch: Tensor) -> Tensor:
         """(N, D), (N, S, K) -> (N, 64, 64, 3), about -0.5 .. 0.5."""
         code = self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
-        return self.layers(code[..., None, None]).permute(0, 2, 3, 1)
+        image = in_pieces(self.layers, code[..., None, None], 32 * 32 * max(self.depth, 12))
+        return image.permute(0, 2, 3, 1)
 
 
 class Head(nn.Module):
@@ -198,9 +213,23 @@ class Head(nn.Module):
         return out.unflatten(0, feat.shape[:-1])
 
 
+def in_pieces(layers: nn.Module, x: Tensor, largest: int) -> Tensor:
+    """`layers(x)`, on a CPU for a few rows at a time.
+
+    Memory beyond 32 MB is not kept by glibc's malloc but given back, and fetched from the system
+    page by page at the next call, which takes as long as the convolutions.
+
+    :param largest: the numbers that a row has where it has most
+    """
+    rows = max(1, PIECE // largest)
+    if x.device.type != "cpu" or len(x) <= rows:
+        return layers(x)
+    return torch.cat([layers(piece) for piece in x.split(rows)])
+
+
 def to_unit(image: Tensor) -> Tensor:
     """uint8 pixels -> float32 in [-0.5, 0.5]."""
-    return image.float() / 255 - 0.5
+    return image.float().div_(255).sub_(0.5)
 
 
 def to_uint8(image: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """All networks in one module, and how they act: filter a latent, then the actor decides."""
 
+import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from wpt_agents.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.networks import Size, frozen
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
-from wpt_agents.world_model import WorldModel
+from wpt_agents.world_model import WorldModel, world_model_update_loss
 
 IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
 State = tuple[np.ndarray, ...]
@@ -203,6 +204,18 @@ class WPTPolicy(BasePolicy):
         return Dream(states, action, torch.stack(entropies, 1), torch.stack(saturated).mean())
 
     @torch.no_grad()
+    def embed(self, image: np.ndarray) -> np.ndarray:
+        """e(o) of Eq. (5): (n, 64, 64, 3) uint8 -> (n, E) float32."""
+        return self.world_model.encoder(self._tensor(image)).float().cpu().numpy()
+
+    def encoder_id(self) -> str:
+        """A hash of the encoder's weights, by which an index knows whose features it holds."""
+        digest = hashlib.sha256()
+        for tensor in self.world_model.encoder.state_dict().values():
+            digest.update(tensor.cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    @torch.no_grad()
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
         """What the world model expects to see: `context` reconstructions, then a dream.
 
@@ -214,17 +227,19 @@ class WPTPolicy(BasePolicy):
         return frames[0].cpu().numpy()
 
     @torch.no_grad()
-    def reward_error(self, trajectory: Trajectory, images: int = 256) -> float:
-        """Mean absolute error of the predicted rewards of an episode, its first `images` at most.
+    def heldout_errors(self, trajectory: Trajectory, images: int = 256) -> dict[str, float]:
+        """How far the world model is off on an episode with rewards that it has not replayed yet.
 
-        On an episode that is not yet in the replay buffer, an error on held-out steps.
+        :param images: at most so many, from the episode's start
+        :return: `reconstruction`, the squared error of Eq. (1) summed over an image, and `reward`,
+            the mean absolute error; both averaged over the steps
         """
         stop = min(len(trajectory) + 1, images)
         batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)]).to(self.device)
-        generator = Generator(self.device).manual_seed(0)
-        post, _, _ = self.world_model.observe(batch, generator)
-        error = (self.world_model.reward(post.feat) - batch.reward).abs()
-        return error[batch.reward_known].mean().item()
+        model = self.world_model
+        loss, post = world_model_update_loss(model, batch, Generator(self.device).manual_seed(0))
+        error = (model.reward(post.feat) - batch.reward).abs()[batch.reward_known].mean()
+        return {"reconstruction": loss.reconstruction.item(), "reward": error.item()}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

@@ -8,7 +8,9 @@ Example::
 """
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch  # noqa: F401  # before faiss: the other way round crashes on some builds
@@ -26,6 +28,7 @@ class Retriever:
     :param action_dims: (N,) int
     :param embodiments: N names, None where unknown
     :param encoder_id: which encoder made the features, e.g. a hash of its weights
+    :param dataset_id: of which trajectories, e.g. the dataset's fingerprint
     """
 
     def __init__(
@@ -34,6 +37,7 @@ class Retriever:
         action_dims: np.ndarray,
         embodiments: Sequence[str | None],
         encoder_id: str,
+        dataset_id: str = "",
     ) -> None:
         assert len(features) == len(action_dims) == len(embodiments), len(features)
         if not np.isfinite(features).all():
@@ -41,7 +45,7 @@ class Retriever:
         self.features = np.ascontiguousarray(features, np.float32)
         self.action_dims = np.asarray(action_dims)
         self.embodiments = list(embodiments)
-        self.encoder_id = encoder_id
+        self.encoder_id, self.dataset_id = encoder_id, dataset_id
 
     @classmethod
     def build(
@@ -67,10 +71,37 @@ class Retriever:
                 features[at : at + len(image)] = found
                 at += len(image)
                 bar.update(len(image))
-        return cls(features, dataset.action_dims, dataset.embodiments, encoder_id)
+        labels = dataset.action_dims, dataset.embodiments
+        return cls(features, *labels, encoder_id, dataset.fingerprint)
+
+    @classmethod
+    def beside(
+        cls,
+        dataset: TrajectoryDataset,
+        embed: Callable[[np.ndarray], np.ndarray],
+        encoder_id: str,
+        progress_bar: bool = False,
+    ) -> "Retriever":
+        """The index that stands beside the dataset; built and saved if missing or out of date.
+
+        A subset's is built each time, since the folder's is of the whole dataset.
+        """
+        path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
+        whole = not dataset.is_subset
+        if whole and path.exists():
+            retriever = cls.load(path, encoder_id)
+            if retriever.dataset_id == dataset.fingerprint:
+                return retriever
+        retriever = cls.build(dataset, embed, encoder_id, progress_bar)
+        try:
+            if whole:
+                retriever.save(path)
+        except OSError as error:
+            warnings.warn(f"The index is kept in memory only: {error}", stacklevel=2)
+        return retriever
 
     def __len__(self) -> int:
-        """The number of trajectories; another than the dataset's means: build it again."""
+        """The number of trajectories."""
         return len(self.features)
 
     def search(
@@ -116,7 +147,11 @@ class Retriever:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file, whole or not at all."""
-        about = {"encoder_id": self.encoder_id, "embodiments": self.embodiments}
+        about = {
+            "encoder_id": self.encoder_id,
+            "dataset_id": self.dataset_id,
+            "embodiments": self.embodiments,
+        }
         arrays = {"features": self.features, "action_dims": self.action_dims}
         save_arrays(path, "Retriever", about, arrays)
 
@@ -132,4 +167,5 @@ class Retriever:
                 f"{path} was built with the encoder {about['encoder_id']}, this one is "
                 f"{encoder_id}; delete the file and build the index again"
             )
-        return cls(arrays["features"], arrays["action_dims"], about["embodiments"], encoder_id)
+        labels = arrays["action_dims"], about["embodiments"]
+        return cls(arrays["features"], *labels, encoder_id, about.get("dataset_id", ""))

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from wpt_agents.policy import State, WPTPolicy, prior_action, stack_frames, to_images
 from wpt_agents.trajectory import Trajectory
@@ -89,6 +91,21 @@ class Rollout:
         )
         self.images[i], self.actions[i], self.rewards[i] = [], [], []
         return trajectory
+
+
+def step_all(env: VecEnv, action: np.ndarray) -> VecEnvStepReturn:
+    """One step of every environment.
+
+    :raises RuntimeError: a worker process is gone; what was learnt and recorded is not
+    """
+    try:
+        return env.step(action)
+    except (EOFError, ConnectionError) as error:  # all that SubprocVecEnv's pipes tell
+        raise RuntimeError(
+            "A worker process of the vector environment died; its own error stands above, if it "
+            "left one. The model is whole: give set_env() a new environment and call "
+            "learn(..., reset_num_timesteps=False)"
+        ) from error
 
 
 def clone_guide(policy: WPTPolicy) -> Callable[[np.ndarray], np.ndarray]:

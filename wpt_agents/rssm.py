@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import mode_one_hot, sample_one_hot, unimix_logits
 from wpt_agents.networks import NORM_EPS, BlockLinear, LinearNorm, Size
+from wpt_agents.scan import FilterScan
 
 
 class Latent(NamedTuple):
@@ -135,21 +136,69 @@ class RSSM(nn.Module):
         """
         batch, length = is_first.shape
         assert embed.shape[:2] == action.shape[:2] == (batch, length), (embed.shape, action.shape)
-        keep = (~is_first).to(embed.dtype)
-        action_embed = self.gru.from_action(action * keep[..., None]).unbind(1)
-        embed_half = self._embed_half(embed).unbind(1)
-        deter, stoch = state or self.initial(batch)
+        state = state or self.initial(batch)
+        action_embed = self.gru.from_action(action * (~is_first[..., None]).to(embed.dtype))
+        embed_half = self._embed_half(embed)
+        # a device with a queue of its own would gain less, and autocast knows no such function
+        by_hand = embed.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
+        if by_hand and sample and torch.is_grad_enabled():
+            post, post_logits = self._scan(embed_half, action_embed, is_first, state, generator)
+        else:
+            post, post_logits = self._filter(
+                embed_half, action_embed, is_first, state, generator, sample
+            )
+        return post, post_logits, self.prior(post.deter)
+
+    def _filter(
+        self,
+        embed_half: Tensor,
+        action_embed: Tensor,
+        is_first: Tensor,
+        state: Latent,
+        generator: Generator | None = None,
+        sample: bool = True,
+    ) -> tuple[Latent, Tensor]:
+        """Step by step: the posterior Latent (B, T, ...) and its log-probabilities."""
+        deter, stoch = state
+        keep = (~is_first).to(embed_half.dtype)
         deters, stochs, logits = [], [], []
         for t, mask in enumerate(keep.unbind(1)):
             deter, stoch = deter * mask[:, None], stoch * mask[:, None, None]
-            deter = self.gru(deter, stoch, action_embed[t])
-            post_logits = self._posterior(deter, embed_half[t])
+            deter = self.gru(deter, stoch, action_embed[:, t])
+            post_logits = self._posterior(deter, embed_half[:, t])
             stoch = sample_one_hot(post_logits, generator) if sample else mode_one_hot(post_logits)
             deters.append(deter)
             stochs.append(stoch)
             logits.append(post_logits)
-        post = Latent(torch.stack(deters, 1), torch.stack(stochs, 1))
-        return post, torch.stack(logits, 1), self.prior(post.deter)
+        return Latent(torch.stack(deters, 1), torch.stack(stochs, 1)), torch.stack(logits, 1)
+
+    def _scan(
+        self,
+        embed_half: Tensor,
+        action_embed: Tensor,
+        is_first: Tensor,
+        state: Latent,
+        generator: Generator | None = None,
+    ) -> tuple[Latent, Tensor]:
+        """What `_filter` returns, in far fewer operators."""
+        gru, hidden = self.gru, self.size.hidden
+        own, shared = gru.hidden.weight.split([self.size.deter // gru.blocks, 3 * hidden], 1)
+        shared = shared.transpose(0, 1).flatten(1)  # each block's view of all of z and a, at once
+        state_part, action_part = shared.split([2 * hidden, hidden])
+        action_half = action_embed.transpose(0, 1) @ action_part + gru.hidden.bias
+        deters, stochs, logits = FilterScan.apply(
+            self.unimix,
+            generator,
+            is_first.t(),
+            action_half,
+            embed_half.transpose(0, 1),
+            *state,
+            *(p for layers in (gru.from_deter, gru.from_stoch) for p in layers.parameters()),
+            *(state_part.t(), own, *gru.norm.parameters(), *gru.gates.parameters()),
+            *(self.post_in.weight[:, : self.size.deter], *self.post_out.parameters()),
+        )
+        post = Latent(deters.transpose(0, 1), stochs.transpose(0, 1))
+        return post, logits.transpose(0, 1)
 
     def imagine(
         self,

@@ -104,15 +104,15 @@ class Batch:
         assert len(set(shapes.values())) == 1, shapes
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch on `device`."""
-        return Batch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
-    @staticmethod
-    def cat(batches: Sequence["Batch"]) -> "Batch":
-        """Joins batches of one length along B."""
+        """The same batch on `device`; from pinned memory the copy runs beside the computation."""
+        pinned = self.image.is_pinned()
         return Batch(
-            **{f.name: torch.cat([getattr(b, f.name) for b in batches]) for f in fields(Batch)}
+            **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)}
         )
+
+    def pin(self) -> "Batch":
+        """The same batch in pinned memory."""
+        return Batch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
 
 def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[str, np.ndarray]:

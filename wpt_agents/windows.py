@@ -27,13 +27,15 @@ class Windows:
     def __init__(self, lengths: np.ndarray) -> None:
         assert len(lengths) > 0
         self._images = np.asarray(lengths, np.int64) + 1
-        self._ends: dict[int, np.ndarray] = {}  # window length -> (N,) cumulative counts
+        self._ends = (0, self._images)  # window length, (N,) cumulative counts; one object, so
+        # that threads drawing windows of different lengths do not mix them
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
         """The pieces of `batch_size` windows: of one, or of several if trajectories are short."""
-        if length not in self._ends:
-            self._ends = {length: np.cumsum(np.maximum(self._images - length + 1, 1))}
-        ends = self._ends[length]
+        known, ends = self._ends
+        if known != length:
+            ends = np.cumsum(np.maximum(self._images - length + 1, 1))
+            self._ends = length, ends
         draws = rng.integers(ends[-1], size=batch_size)
         chosen = np.searchsorted(ends, draws, side="right")
         starts = draws - np.concatenate([[0], ends])[chosen]

@@ -3,15 +3,14 @@
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
-from wpt_agents.distributions import kl_one_hot, two_hot_loss, two_hot_mean
+from wpt_agents.distributions import BINS, kl_one_hot, two_hot_loss, two_hot_mean
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import Decoder, Encoder, Head, Size, to_uint8, to_unit
 from wpt_agents.rssm import RSSM, Latent
 from wpt_agents.trajectory import Batch
-
-REWARD_BINS = 255
 
 
 class WorldModelLoss(NamedTuple):
@@ -47,7 +46,7 @@ def world_model_loss(
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
     assert post_logits.shape == prior_logits.shape, (post_logits.shape, prior_logits.shape)
-    error = (reconstruction - image).square().sum((-1, -2, -3)).mean()
+    error = F.mse_loss(reconstruction, image, reduction="sum") / image.shape[:-3].numel()
     dyn = kl_one_hot(post_logits.detach(), prior_logits)
     rep = kl_one_hot(post_logits, prior_logits.detach())
     if free_nats_mode not in ("mean", "element"):
@@ -90,7 +89,7 @@ class WorldModel(nn.Module):
 
     def reset_reward_head(self) -> None:
         """Draws the reward head anew: rewards belong to a task, the rest does not."""
-        self.reward_head = Head(self.size, 2, REWARD_BINS, self.zero_init_heads)
+        self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
         """All of theta: everything but the reward head."""

@@ -8,7 +8,6 @@ Example::
     action, state = model.predict(obs, state, episode_start, deterministic=True)
 """
 
-import hashlib
 import inspect
 import os
 import shutil
@@ -18,10 +17,10 @@ import time
 import warnings
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -35,17 +34,18 @@ from torch import Generator, Tensor
 from torch.optim import AdamW
 from tqdm.auto import tqdm
 
-from wpt_agents.behavior_cloning import FRAMES, bc_loss, random_shift
+from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
-from wpt_agents.model_file import load_optimizer, optimizer_tensors, read_model, write_model
+from wpt_agents.model_file import read_model
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
-from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, State, WPTPolicy, to_images
+from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
-from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide
+from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, step_all
+from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, PRETRAIN, WARMUP, WINDOW, Updates, torch_seed
 
@@ -53,7 +53,7 @@ Data = str | os.PathLike[str] | TrajectoryDataset | Iterable[Trajectory]
 EVERY = 1000  # pre-training steps between checkpoints
 
 
-class WPT(Updates, BaseAlgorithm):
+class WPT(Updates, Saving, BaseAlgorithm):
     """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
 
     Example::
@@ -386,7 +386,7 @@ class WPT(Updates, BaseAlgorithm):
         if self.dataset is None or self.retrieved is not None or not (guided or self.offline_ratio):
             return
         if not self.retrieved_ids or max(self.retrieved_ids) >= len(self.dataset):
-            query = self.embed(to_images(self._last_obs)[0][:1])[0]
+            query = self.policy.embed(to_images(self._last_obs)[0][:1])[0]
             self.retrieved_ids = self._search(query, progress_bar)
         self.retrieved = ReplayBuffer()
         for trajectory in self.dataset.subset(self.retrieved_ids):
@@ -407,51 +407,21 @@ class WPT(Updates, BaseAlgorithm):
     def build_index(self, progress_bar: bool = False) -> Retriever:
         """The index over the dataset's first images by this encoder, kept beside the dataset."""
         assert self.dataset is not None
-        encoder_id = self.encoder_id()
-        path = Path(self.dataset.path) / f"retrieval-{encoder_id[:12]}.index"
-        whole = len(self.dataset) == len(TrajectoryDataset.open(path.parent))  # not a subset
-        if whole and path.exists():
-            retriever = Retriever.load(path, encoder_id)
-            if len(retriever) == len(self.dataset):
-                return retriever
-        retriever = Retriever.build(self.dataset, self.embed, encoder_id, progress_bar)
-        try:
-            if whole:
-                retriever.save(path)
-        except OSError as error:
-            warnings.warn(f"The index is kept in memory only: {error}", stacklevel=2)
-        return retriever
-
-    @torch.no_grad()
-    def embed(self, image: np.ndarray) -> np.ndarray:
-        """e(o) of Eq. (5): (n, 64, 64, 3) uint8 -> (n, E) float32."""
-        images = torch.from_numpy(image).to(self.device)
-        return self.policy.world_model.encoder(images).float().cpu().numpy()
-
-    def encoder_id(self) -> str:
-        """A hash of the encoder's weights."""
-        digest = hashlib.sha256()
-        for tensor in self.policy.world_model.encoder.state_dict().values():
-            digest.update(tensor.cpu().numpy().tobytes())
-        return digest.hexdigest()
+        policy = self.policy
+        return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
 
     def _clone(self, progress_bar: bool) -> None:
         """// Behavior Cloning Policy Training, on the retrieved trajectories."""
         if self.retrieved is None or self.cloned or parse_schedule(self.guidance)(0) == 0:
             return
-        policy, width = self.policy, self.max_action_dim
+        policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
         optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
         for step in tqdm(range(self.bc_steps), desc="clone", disable=not progress_bar):
-            generator = self._generator(CLONE, step)
-            rng = self._stream(CLONE, step)
-            batch = self.retrieved.sample(self.bc_batch_size, FRAMES + 1, width, rng)
-            batch = batch.to(self.device)
+            pairs = draw_pairs(shown, self.bc_batch_size, width, self._stream(CLONE, step))
+            image, action = (tensor.to(self.device) for tensor in pairs)
             with self._autocast():
-                frames = random_shift(batch.image[:, :FRAMES], generator=generator)
-                # the action that led to image F was taken at image F - 1, the last one shown
-                loss = bc_loss(
-                    policy.prior_actor(frames), batch.action[:, FRAMES], policy.action_mask
-                )
+                image = random_shift(image, generator=self._generator(CLONE, step))
+                loss = bc_loss(policy.prior_actor(image), action, policy.action_mask)
             self._descend(optimizer, loss, "bc")
         self.cloned = True
 
@@ -466,16 +436,15 @@ class WPT(Updates, BaseAlgorithm):
         while go_on and not ended and self.num_timesteps < self._total_timesteps:
             image, _ = to_images(self._last_obs)
             action = rollout.act(image, self._guide())
-            new_obs, rewards, dones, infos = self.env.step(self.policy.to_env(action))
+            new_obs, rewards, dones, infos = step_all(self.env, self.policy.to_env(action))
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.learning_starts:
                 self.credit += self.n_envs
             finished = rollout.end_step(rewards, dones, last_images(infos, dones))
             for trajectory in finished:  # before the callback, which may save the replay buffer
-                if self.updates:
-                    error = self.policy.reward_error(trajectory)
-                    self.logger.record_mean("train/heldout_reward_error", error)
+                for name, error in self.policy.heldout_errors(trajectory).items():
+                    self.logger.record_mean(f"train/heldout_{name}_error", error)
                 self.replay_buffer.add(trajectory)
                 self._seen_length = max(self._seen_length or 0, len(trajectory))
             self.episodes += len(finished)
@@ -534,22 +503,6 @@ class WPT(Updates, BaseAlgorithm):
 
     # ------------------------------------------------------------------------------- acting
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """The actor's action in the environment's own space, and the state to hand back.
-
-        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8
-        :param state: what the last call returned, None at the start
-        :param episode_start: (n,) bool, where an episode begins
-        :param deterministic: no sampling, neither of latents nor of actions
-        """
-        return self.policy.predict(observation, state, episode_start, deterministic)
-
     @property
     def prior(self) -> PriorPolicy | None:
         """The prior actor, with `predict`; None before it is cloned."""
@@ -579,115 +532,7 @@ class WPT(Updates, BaseAlgorithm):
         record("train/updates", self.updates)
         self.logger.dump(step=self.num_timesteps)
 
-    # ------------------------------------------------------------------------ saving and loading
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "model_optimizer", "actor_optimizer", "critic_optimizer"], []
-
-    def save(
-        self,
-        path: str | os.PathLike[str] | BinaryIO,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """Writes the model file: weights, optimisers, settings and counters; no replay, no data.
-
-        :param path: `.zip` is added when there is no suffix
-        :param exclude: accepted for SB3's sake; nothing optional is in the file
-        :param include: likewise
-        """
-        if isinstance(path, str | os.PathLike) and not Path(path).suffix:
-            path = Path(path).with_suffix(".zip")
-        space = self.action_space
-        about = {
-            "hyperparameters": self.hyperparameters,
-            "action_space": {"low": space.low.tolist(), "high": space.high.tolist()},
-            "dataset": str(self.dataset.path) if self.dataset is not None else None,
-            "counters": {name: getattr(self, name) for name in COUNTERS},
-        }
-        optimizers = self._get_torch_save_params()[0][1:]
-        weights = self.policy.state_dict()
-        tensors = {"policy": {k.replace("_orig_mod.", ""): w for k, w in weights.items()}}
-        tensors |= {name: optimizer_tensors(getattr(self, name)) for name in optimizers}
-        write_model(path, about, tensors)
-
-    @classmethod
-    def load(
-        cls,
-        path: str | os.PathLike[str] | BinaryIO,
-        env: GymEnv | str | None = None,
-        device: torch.device | str = "auto",
-        custom_objects: Mapping[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> "WPT":
-        """Reads a model file onto any environment of at most `max_action_dim` actions.
-
-        :param path: as given to `save`
-        :param env: the environment to go on with
-        :param custom_objects: accepted for SB3's sake
-        :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
-        :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
-        """
-        if isinstance(path, str | os.PathLike) and not Path(path).suffix:
-            path = Path(path).with_suffix(".zip")
-        cls._check_keywords(kwargs)
-        about, tensors = read_model(path)
-        model = cls(device=device, **{**about["hyperparameters"], **kwargs})
-        low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
-        model.action_space = spaces.Box(low, high)
-        model.policy.set_action_space(model.action_space)
-        model._take(about, tensors, ("size", "max_action_dim"))
-        if env is not None:
-            model.set_env(env, force_reset)
-        return model
-
-    def _take(
-        self,
-        about: Mapping[str, Any],
-        tensors: Mapping[str, dict[str, Tensor]],
-        same: Iterable[str],
-    ) -> None:
-        for name in same:
-            was, now = about["hyperparameters"][name], self.hyperparameters[name]
-            if was != now:
-                raise ValueError(
-                    f"The model was trained with {name}={was!r}, now it is {now!r}; "
-                    "give the old value, or another model file or run_dir"
-                )
-        self.policy.load_state_dict(tensors["policy"])
-        for name in self._get_torch_save_params()[0][1:]:
-            load_optimizer(getattr(self, name), tensors[name])
-        for name in COUNTERS:
-            setattr(self, name, about["counters"][name])
-
-    def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Writes the online episodes to one file."""
-        self.replay_buffer.save(path)
-
-    def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Reads what `save_replay_buffer` wrote."""
-        self.replay_buffer = ReplayBuffer.load(path)
-
-    @classmethod
-    def _check_keywords(cls, kwargs: Mapping[str, Any]) -> None:
-        for name in kwargs:
-            if name not in KEYWORDS:
-                raise unknown_name("keyword", name, KEYWORDS)
-
 
 CHOICES = {"size": SIZES, "precision": ("fp32", "bf16"), "free_nats_mode": ("mean", "element")}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}
-COUNTERS = (
-    "pretrain_steps",
-    "num_timesteps",
-    "episodes",
-    "updates",
-    "credit",
-    "cloned",
-    "retrieved_ids",
-    "_windows_drawn",
-    "_seen_length",
-)

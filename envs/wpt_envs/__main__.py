@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from wpt_envs.tasks import TASKS
+from wpt_envs.tasks import TASKS, Task
 
 
 def main() -> None:
@@ -17,8 +17,10 @@ def main() -> None:
     montage.add_argument("--size", type=int, default=64)
     likeness = commands.add_parser("likeness", help="PSNR in dB against exact")
     likeness.add_argument("--states", type=int, default=20)
+    for command in (montage, likeness):
+        command.add_argument("--suite", choices=sorted({task.suite for task in TASKS.values()}))
     speed = commands.add_parser("speed", help="CPU ms an agent step, beside the usual renderer")
-    speed.add_argument("--steps", type=int, default=40)
+    speed.add_argument("--rounds", type=int, default=5, help="of ten steps each")
     arguments = vars(parser.parse_args())
     run: dict[str, Callable[..., None]] = {
         "list": _list,
@@ -38,29 +40,33 @@ def _list() -> None:
         )
 
 
-def _montage(path: Path, size: int) -> None:
+def _montage(path: Path, size: int, suite: str | None) -> None:
     from wpt_envs.measure import montage
 
-    montage(list(TASKS.values()), path, size)
+    montage(_chosen(suite), path, size)
 
 
-def _likeness(states: int) -> None:
+def _likeness(states: int, suite: str | None) -> None:
     from wpt_envs.measure import likeness
 
-    for task in TASKS.values():
+    for task in _chosen(suite):
         found = likeness(task, states)
         print(
             f"{task.id:44s} near {found['near']:5.1f} dB  fast {found['fast']:5.1f} dB", flush=True
         )
 
 
-def _speed(steps: int) -> None:
+def _chosen(suite: str | None) -> list[Task]:
+    return [task for task in TASKS.values() if suite in (None, task.suite)]
+
+
+def _speed(rounds: int) -> None:
     from wpt_envs.measure import THE_FOUR, speed
 
     for name in THE_FOUR:
-        costs = speed(TASKS[name], steps)
+        costs = speed(TASKS[name], rounds)
         row = "  ".join(
-            f"{rendering} {cost:6.2f} ms (x{costs['usual'] / cost:4.1f})"
+            f"{rendering} {cost:6.2f} ms (x{costs['exact'] / cost:4.1f})"
             for rendering, cost in costs.items()
         )
         print(f"{name:32s} {row}", flush=True)

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from wpt_envs import tasks
-from wpt_envs.rendering import View  # before dm_control: it chooses the GL backend
+from wpt_envs.rendering import Camera, View  # before dm_control: it chooses the GL backend
 from wpt_envs.simulated import Simulated, StepResult
 from wpt_envs.wrappers import dress
 
@@ -29,7 +29,7 @@ def make(
     action_repeat: int = 2,
     pad_action_to: int | str | None = None,
     rendering: str = "near",
-    camera: str | int | None = None,
+    camera: Camera | None = None,
     state_in_info: bool = False,
     seed: int | None = None,
     render_mode: str | None = "rgb_array",
@@ -81,12 +81,11 @@ class DMControl(Simulated):
     Truncated after 1000 control steps; never terminated.
 
     ## Arguments
-    `image_size=64`, `action_repeat=2`, `pad_action_to=None` (a number, or `"suite"`: 12),
-    `rendering="near"` (`"exact"`, `"fast"`), `camera` (name, number or a free camera's
-    attributes), `state_in_info=False`, `seed` (of the first reset), `render_mode="rgb_array"`,
-    `render_size` (of `render()`; the observation's by default), `rescale_action=False` (maps
-    [-1, 1] onto the actuators' range), `floor` (half the drawn length of the floor in metres;
-    the stock walker's ends 2 m behind it).
+    Those of `wpt_envs.simulated.Simulated`, with `pad_action_to="suite"` being 12, and
+
+    - `rescale_action=False`: maps [-1, 1] onto the actuators' range.
+    - `floor=None`: half the drawn length of the floor in metres; the stock walker's floor ends
+      2 m behind it.
 
     ## Version History
     v0: dm_control 1.0.28, mujoco 3.3.0.
@@ -96,7 +95,7 @@ class DMControl(Simulated):
         self,
         task: tasks.Task,
         rendering: str = "near",
-        camera: str | int | None = None,
+        camera: Camera | None = None,
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
         rescale_action: bool = False,

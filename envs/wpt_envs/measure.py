@@ -57,34 +57,35 @@ def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
     return {rendering: float(np.mean(values)) for rendering, values in found.items()}
 
 
-def step_cost(env: gym.Env, steps: int = 40) -> float:
-    """CPU milliseconds (of the process, all threads) an agent step."""
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(steps + 2)]
-    for action in actions[:2]:
-        env.step(action)
-    start = time.process_time()
-    for action in actions[2:]:
-        env.step(action)
-    return (time.process_time() - start) / steps * 1000
+def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:
+    """CPU ms an agent step at each rendering, and by the suite's own renderer.
 
-
-def speed(task: Task, steps: int = 40) -> dict[str, float]:
-    """CPU ms an agent step at each rendering, and with the suite's usual renderer."""
-    costs = {}
-    for rendering in QUALITIES:
-        env = gym.make(task.id, rendering=rendering)
-        costs[rendering] = step_cost(env, steps)
-        env.close()
-    env = gym.make(task.id)
-    bare: Any = env.unwrapped
+    They take turns, `steps` steps each, and the median of the rounds counts: a machine that is
+    busy with other things for a while then slows all of them, or none.
+    """
+    envs = {rendering: gym.make(task.id, rendering=rendering) for rendering in QUALITIES}
+    envs["usual"] = gym.make(task.id)
+    bare: Any = envs["usual"].unwrapped
     usual, free = usual_renderer(bare)
     bare.look = lambda size: usual()
-    costs["usual"] = step_cost(env, steps)
+    for env in envs.values():
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        _step_cost(env, 2)  # opens the GL context
+    costs = [{name: _step_cost(env, steps) for name, env in envs.items()} for _ in range(rounds)]
     free()
-    env.close()
-    return costs
+    for env in envs.values():
+        env.close()
+    return {name: float(np.median([cost[name] for cost in costs])) for name in envs}
+
+
+def _step_cost(env: gym.Env, steps: int) -> float:
+    """CPU milliseconds of the process, all its threads, an agent step."""
+    actions = [env.action_space.sample() for _ in range(steps)]
+    start = time.process_time()
+    for action in actions:
+        env.step(action)
+    return (time.process_time() - start) / steps * 1000
 
 
 def usual_renderer(env: Any) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:

@@ -7,8 +7,8 @@ import numpy as np
 from gymnasium import spaces
 
 from wpt_envs import tasks
-from wpt_envs.rendering import View  # before metaworld: it chooses the GL backend
-from wpt_envs.simulated import Simulated, StepResult
+from wpt_envs.rendering import Camera, View  # before metaworld: it chooses the GL backend
+from wpt_envs.simulated import Achieved, StepResult
 from wpt_envs.wrappers import dress
 
 # isort: split
@@ -24,7 +24,7 @@ def make(
     action_repeat: int = 2,
     pad_action_to: int | str | None = None,
     rendering: str = "near",
-    camera: str | int = "corner4",
+    camera: Camera = "corner4",
     state_in_info: bool = False,
     seed: int | None = None,
     render_mode: str | None = "rgb_array",
@@ -42,7 +42,7 @@ def make(
     )
 
 
-class MetaWorld(Simulated):
+class MetaWorld(Achieved):
     """A task of Meta-World at its control rate; `make` puts the pixels around it.
 
     ## Description
@@ -71,9 +71,7 @@ class MetaWorld(Simulated):
     Truncated after 200 control steps; never terminated, success or not.
 
     ## Arguments
-    `image_size=64`, `action_repeat=2`, `pad_action_to=None` (a number, or `"suite"`: 4),
-    `rendering="near"` (`"exact"`, `"fast"`), `camera="corner4"`, `state_in_info=False`, `seed`
-    (of the first reset), `render_mode="rgb_array"`, `render_size` (of `render()`).
+    Those of `wpt_envs.simulated.Simulated`. `pad_action_to="suite"` is 4.
 
     ## Version History
     v0: metaworld 3.1.1, mujoco 3.3.0.
@@ -83,14 +81,13 @@ class MetaWorld(Simulated):
         self,
         task: tasks.Task,
         rendering: str = "near",
-        camera: str | int = "corner4",
+        camera: Camera = "corner4",
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
         self.sawyer = _goal_observable(ALL_V3_ENVIRONMENTS[f"{task.name}-v3"]())
         super().__init__(task, seed, render_mode, fps=1 / self.sawyer.dt)
         self.view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)
-        self._frame, self._ever = 0, False
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         self.observation_space = self._bounds = self.sawyer.sawyer_observation_space
 
@@ -104,20 +101,12 @@ class MetaWorld(Simulated):
         mujoco.mj_resetData(self.sawyer.model, self.sawyer.data)  # forget the last episode wholly
         state, _ = self.sawyer.reset()
         mujoco.mj_forward(self.sawyer.model, self.sawyer.data)  # else the goal is drawn elsewhere
-        self._frame, self._ever = 0, False
-        return self._bounded(state), self._info(False)
+        return self._bounded(state), self._began()
 
     def step(self, action: np.ndarray) -> StepResult:
         """One control step; success never ends an episode."""
         state, reward, _, _, info = self.sawyer.step(action)
-        self._frame += 1
-        truncated = self._frame >= self.task.frames
-        return self._bounded(state), float(reward), False, truncated, self._info(info["success"])
-
-    def _info(self, success: float) -> dict[str, Any]:
-        """`is_success` is `success` under the name which Stable-Baselines3 looks for."""
-        self._ever = self._ever or bool(success)
-        return {"success": bool(success), "success_any": self._ever, "is_success": bool(success)}
+        return self._bounded(state), float(reward), False, *self._stepped(info["success"])
 
     def _bounded(self, state: np.ndarray) -> np.ndarray:
         return np.clip(state, self._bounds.low, self._bounds.high)

@@ -24,8 +24,7 @@ _FLAGS = {
     "reflection": mujoco.mjtRndFlag.mjRND_REFLECTION,
 }
 
-
-Camera = str | int | dict[str, Any]
+Camera = str | int | dict[str, Any]  # a name, a number, or the free camera's attributes
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ QUALITIES = {
     "fast": Quality(
         samples=0,
         supersample=2,
+        shadow_size=0,
         tessellation=(10, 5, 1),
         floor_spacing=2,
         cell=0.005,

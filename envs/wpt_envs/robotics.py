@@ -7,12 +7,13 @@ import numpy as np
 from gymnasium import spaces
 
 from wpt_envs import tasks
-from wpt_envs.rendering import View  # before gymnasium_robotics: it chooses the GL backend
-from wpt_envs.simulated import Simulated, StepResult
+from wpt_envs.rendering import Camera, View  # before gymnasium_robotics: it chooses the GL backend
+from wpt_envs.simulated import Achieved, StepResult
 from wpt_envs.wrappers import dress
 
 # isort: split
 import gymnasium_robotics
+import mujoco
 
 _IDS = {
     "fetch-reach": "FetchReach-v4",
@@ -37,7 +38,7 @@ def make(
     action_repeat: int = 1,
     pad_action_to: int | str | None = None,
     rendering: str = "near",
-    camera: str | int | None = None,
+    camera: Camera | None = None,
     state_in_info: bool = False,
     seed: int | None = None,
     render_mode: str | None = "rgb_array",
@@ -55,7 +56,7 @@ def make(
     )
 
 
-class Robotics(Simulated):
+class Robotics(Achieved):
     """A task of Gymnasium-Robotics at its control rate; `make` puts the pixels around it.
 
     ## Description
@@ -63,7 +64,9 @@ class Robotics(Simulated):
     Adroit (door, hammer, pen, relocate): further embodiments, not counted among the paper's.
 
     ## Action Space
-    `Box(-1, 1, (n,), float32)`: n is 4 for Fetch, 20 for the Shadow hand, 24 to 30 for Adroit.
+    `Box(-1, 1, (n,), float32)`: n is 4 for Fetch (the gripper's move along x, y and z, and its
+    opening), 20 for the Shadow hand (its joints), and for Adroit (the arm's and the hand's
+    joints) 28 at the door, 26 with the hammer, 24 with the pen, 30 to relocate.
 
     ## Observation Space
     `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
@@ -71,8 +74,9 @@ class Robotics(Simulated):
     goals, is in `info["state"]` with `state_in_info`.
 
     ## Rewards
-    The environment's: Fetch and Shadow hand -1 until success, Adroit dense. `info["success"]`,
-    `info["success_any"]` and `info["is_success"]` are as in Meta-World.
+    The environment's, summed over `action_repeat`: for Fetch and the Shadow hand 0 at a control
+    step with success and else -1, for Adroit dense. `info["success"]`, `info["success_any"]`
+    and `info["is_success"]` are as in Meta-World.
 
     ## Starting State
     The environment's; `reset(seed=s)` starts its stream anew.
@@ -82,7 +86,8 @@ class Robotics(Simulated):
     never terminated.
 
     ## Arguments
-    As in DMControl, but `action_repeat=1`, and `pad_action_to="suite"` is 30.
+    Those of `wpt_envs.simulated.Simulated`. `action_repeat` is 1 by default;
+    `pad_action_to="suite"` is 30.
 
     ## Version History
     v0: gymnasium-robotics 1.4.2, mujoco 3.3.0.
@@ -92,18 +97,15 @@ class Robotics(Simulated):
         self,
         task: tasks.Task,
         rendering: str = "near",
-        camera: str | int | None = None,
+        camera: Camera | None = None,
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
         gym.register_envs(gymnasium_robotics)
         self.robot = cast(Any, gym.make(_IDS[task.name], disable_env_checker=True).unwrapped)
         super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)
-        usual = self.robot.mujoco_renderer.default_cam_config
-        self.view = View(
-            self.robot.model, self.robot.data, rendering, usual if camera is None else camera
-        )
-        self._frame, self._ever = 0, False
+        camera = _usual_camera(self.robot) if camera is None else camera
+        self.view = View(self.robot.model, self.robot.data, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         self._space = self.robot.observation_space
         size = spaces.flatdim(self._space)
@@ -114,16 +116,13 @@ class Robotics(Simulated):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode, from the robot's own stream of goals."""
         observation, _ = self.robot.reset(seed=self._seeded(seed))
-        self._frame, self._ever = 0, False
-        return self._state(observation), self._info(False)
+        return self._state(observation), self._began()
 
     def step(self, action: np.ndarray) -> StepResult:
         """One control step; success never ends an episode."""
         observation, reward, _, _, info = self.robot.step(action)
-        self._frame += 1
-        truncated = self._frame >= self.task.frames
         success = info.get("is_success", info.get("success", False))
-        return self._state(observation), float(reward), False, truncated, self._info(success)
+        return self._state(observation), float(reward), False, *self._stepped(success)
 
     def _state(self, observation: Any) -> np.ndarray:
         """Flattens it, and puts the goal's marker in its place whether or not anyone looks."""
@@ -132,7 +131,14 @@ class Robotics(Simulated):
             show_goal()
         return np.asarray(spaces.flatten(self._space, observation), np.float64)
 
-    def _info(self, success: float) -> dict[str, Any]:
-        """`is_success` is `success` under the name which Stable-Baselines3 looks for."""
-        self._ever = self._ever or bool(success)
-        return {"success": bool(success), "success_any": self._ever, "is_success": bool(success)}
+
+def _usual_camera(robot: Any) -> dict[str, Any]:
+    """Gymnasium's: the environment's own placement, looking at the middle of all shapes.
+
+    Gymnasium takes the middle at its first picture, which comes at any time; here it is that
+    of the model's own pose.
+    """
+    data = mujoco.MjData(robot.model)
+    mujoco.mj_forward(robot.model, data)
+    middle = np.median(data.geom_xpos, axis=0)
+    return {"lookat": middle} | robot.mujoco_renderer.default_cam_config

@@ -65,8 +65,8 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, times: int) -> None:
         RecordConstructorArgs.__init__(self, times=times)
         gym.Wrapper.__init__(self, env)
-        if times < 1:
-            raise ValueError(f"action_repeat={times}; give 1 or more")
+        if times < 1 or times != int(times):
+            raise ValueError(f"action_repeat={times}; give a whole number, 1 or more")
         self._times = times
         self.metadata = dict(env.metadata)
         if "render_fps" in env.metadata:
@@ -103,6 +103,8 @@ class SeePixels(gym.Wrapper, RecordConstructorArgs):
             self, image_size=image_size, state_in_info=state_in_info, render_size=render_size
         )
         gym.Wrapper.__init__(self, env)
+        if min(image_size, render_size or image_size) < 1:
+            raise ValueError(f"{image_size=}, {render_size=}; give 1 or more")
         self._image_size, self._render_size = image_size, render_size or image_size
         self._state_in_info = state_in_info
         self._image: np.ndarray | None = None

@@ -4,6 +4,7 @@ A run collects, pre-trains, indexes, fine-tunes and evaluates; `wpt_agents.zoo.s
 runs share. `result.json` is written last: where it stands, the run is finished.
 """
 
+import fcntl
 import json
 import platform
 import shlex
@@ -21,14 +22,24 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures, report
+from wpt_agents.zoo.checkpoints import (
+    LOGS,
+    Checkpoint,
+    Checkpoints,
+    ContinuedCSV,
+    Evaluations,
+    go_to_episode,
+    last_checkpoint,
+    remove_checkpoints,
+)
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.progress import LearningBar
@@ -69,9 +80,16 @@ def run(job: Run, force: bool = False) -> dict[str, Any]:
     if done is not None:
         say("run", f"finished before, reused (--force starts anew)  [dim]{job.folder}")
         return done
-    if job.folder.exists():
-        shutil.rmtree(job.folder)
-    job.folder.mkdir(parents=True)
+    if force:
+        shutil.rmtree(job.folder, ignore_errors=True)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with locked(job.folder):
+        return _begin(job)
+
+
+def _begin(job: Run) -> dict[str, Any]:
+    """Says in the folder what is being done, then does it."""
+    (job.folder / "error.txt").unlink(missing_ok=True)
     (job.folder / "config.yaml").write_text(yaml.safe_dump(job.config(), sort_keys=False))
     write_json(job.folder / "system.json", system())
     (job.folder / "command.txt").write_text(shlex.join([sys.executable, *sys.orig_argv[1:]]) + "\n")
@@ -85,16 +103,30 @@ def run(job: Run, force: bool = False) -> dict[str, Any]:
 def check_folder(job: Run, force: bool) -> None:
     """Refuses to take a folder that is not this run's."""
     path = job.folder / "config.yaml"
-    if job.folder.exists() and any(job.folder.iterdir()) and not path.exists():
+    others = {each.name for each in job.folder.glob("*")} - {"lock"}
+    if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
-    if job.result() and not force:
-        held, wanted = yaml.safe_load(path.read_text()), json.loads(json.dumps(job.config()))
-        differ = sorted(k for k in held.keys() | wanted if held.get(k) != wanted.get(k))
+    if path.exists() and not force:
+        before, wanted = yaml.safe_load(path.read_text()), json.loads(json.dumps(job.config()))
+        differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
         if differ:
             raise ValueError(
-                f"{job.folder} holds a finished run with other settings ({', '.join(differ)}); "
+                f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
                 "use another --out, or --force to replace it"
             )
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps a second process out of a run's folder; the lock ends with its process."""
+    with open(folder / "lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{folder} is being worked on by another process: wait for it, or use another --out"
+            ) from None
+        yield
 
 
 class Clock:
@@ -121,14 +153,19 @@ def _work(job: Run) -> dict[str, Any]:
         assert dataset is not None, method
         with clock("pretrain"):
             start = job.shared.model(dataset)
+    checkpoint = last_checkpoint(job.folder)
+    if checkpoint is None:
+        for name in LOGS:
+            (job.folder / name).unlink(missing_ok=True)
+    else:
+        checkpoint.restore_logs(job.folder)
     monitor = str(job.folder / "0.monitor.csv")
     with closing(make_vec_env(job.task.id, job.shared.env, job.seed, monitor=monitor)) as venv:
-        model = make_model(job, venv, dataset, start)
-        if dataset is not None:
+        model = make_model(job, venv, dataset, start, checkpoint)
+        if dataset is not None and checkpoint is None:  # else it has retrieved already
             with clock("index"):
                 job.shared.index(model)
-        with clock("learn"):
-            _learn(job, model)
+        clock.seconds["learn"] = round(_learn(job, model, checkpoint), 1)
         model.save(job.folder / "model.zip")
     with clock("evaluate"):
         model, scores = _evaluate(job, model)
@@ -136,19 +173,28 @@ def _work(job: Run) -> dict[str, Any]:
         _draw(job, model, scores)
     result = _result(job, scores, clock.seconds)
     write_json(job.folder / "result.json", result)
+    remove_checkpoints(job.folder)
     return result
 
 
 def make_model(
-    job: Run, venv: VecEnv, dataset: TrajectoryDataset | None, start: Path | None
+    job: Run,
+    venv: VecEnv,
+    dataset: TrajectoryDataset | None,
+    start: Path | None,
+    checkpoint: Checkpoint | None = None,
 ) -> WPT:
-    """The model to fine-tune: pre-trained, or fresh."""
+    """The model to fine-tune: from where the run stood, pre-trained, or fresh."""
     keywords = {"dataset": dataset, "seed": job.seed, "device": job.device, **job.wpt}
     keywords["embodiment"] = job.task.embodiment
     keywords["episode_length"] = episode_steps(job.task.id, job.shared.env)
-    if start is not None:
-        return _Watched.load(start, env=venv, **keywords)
-    return _Watched("WPTPolicy", venv, **keywords)
+    if checkpoint is not None:
+        return _Watched.load(checkpoint.model, env=venv, **keywords)
+    if start is None:
+        return _Watched("WPTPolicy", venv, **keywords)
+    model = _Watched.load(start, env=venv, **keywords)
+    model.reset_task()  # heads, actor and critic are drawn by this run's seed, not pre-training's
+    return model
 
 
 class _Watched(WPT):
@@ -158,16 +204,28 @@ class _Watched(WPT):
         return super()._init_callback(callback)
 
 
-def _learn(job: Run, model: WPT) -> None:
-    """Stage 4: fine-tuning, evaluated in between where the preset says so."""
-    frames, steps = job.preset.learn.frames, job.preset.steps
-    text = f"{frames:,} frames, {steps:,} steps of {short_name(job.task)}"
+def _learn(job: Run, model: WPT, checkpoint: Checkpoint | None) -> float:
+    """Stage 4: fine-tuning, evaluated in between where the preset says so; its seconds."""
+    frames, steps, given = job.preset.learn.frames, job.preset.steps, job.preset.learn
+    state = f"continued at {model.num_timesteps:,} of " if checkpoint else ""
+    text = f"{state}{frames:,} frames, {steps:,} steps of {short_name(job.task)}"
     say("learn", f"{text}, method {job.method}, seed {job.seed}")
-    logger = configure(str(job.folder), ["csv", "tensorboard"])
+    outputs = [ContinuedCSV(job.folder / "progress.csv"), TensorBoardOutputFormat(str(job.folder))]
+    logger = Logger(str(job.folder), outputs)
     model.set_logger(logger)
+    if checkpoint is not None:
+        checkpoint.restore(model, job.folder)
+        go_to_episode(model.env, model.episodes)
     with closing(logger), _evaluation(job) as evaluation:
-        bar = LearningBar(job.preset.env.action_repeat)
-        model.learn(steps, callback=[bar, *evaluation], log_interval=1, progress_bar=True)
+        repeat = job.preset.env.action_repeat
+        before = checkpoint.state["seconds"] if checkpoint else 0.0
+        checkpoints = Checkpoints(job.folder, given.checkpoint_every // repeat, before)
+        callbacks = [LearningBar(repeat), *evaluation, checkpoints]
+        left = steps - model.num_timesteps
+        model.learn(
+            left, callback=callbacks, log_interval=1, reset_num_timesteps=False, progress_bar=True
+        )
+        return checkpoints.seconds
 
 
 @contextmanager
@@ -179,7 +237,7 @@ def _evaluation(job: Run) -> Iterator[list[BaseCallback]]:
         return
     seed = job.evaluation_seed + 10_000  # apart from training and from the scores at the end
     with closing(make_vec_env(job.task.id, job.shared.env, seed)) as venv:
-        callback = EvalCallback(
+        callback = Evaluations(
             venv,
             n_eval_episodes=given.during_episodes,
             eval_freq=max(1, given.every // job.preset.env.action_repeat),

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import gymnasium as gym
@@ -82,13 +83,42 @@ class Score:
         return cls(given["returns"], given["successes"])
 
 
+class EpisodeSeeds(gym.Wrapper):
+    """Seeds each reset by the number of the episode, so that an episode depends on none before it.
+
+    A seed given to `reset` is that of episode 0, and those of all others are derived from it.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.seed, self.episode = 0, 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins the next episode."""
+        self.seed = self.seed if seed is None else seed
+        drawn = np.random.SeedSequence([self.seed, self.episode]).generate_state(1)
+        own = int(drawn[0] >> 1) if self.episode else self.seed
+        self.episode += 1
+        return self.env.reset(seed=own, options=options)
+
+    def go_to_episode(self, number: int) -> None:
+        """The next reset begins episode `number`."""
+        self.episode = number
+
+
 def make_vec_env(
     task: str, env: Mapping[str, Any], seed: int, n_envs: int = 1, monitor: str | None = None
 ) -> VecEnv:
-    """Seeded copies of a task in one process, each under SB3's Monitor."""
+    """Seeded copies of a task in one process, each under SB3's Monitor.
+
+    :param monitor: the file of its episodes, which is continued if it is there
+    """
+    anew = monitor is None or not Path(monitor).exists()
 
     def make() -> gym.Env:
-        return Monitor(gym.make(task, **env), monitor, info_keywords=())
+        return Monitor(EpisodeSeeds(gym.make(task, **env)), monitor, override_existing=anew)
 
     venv = DummyVecEnv([make] * n_envs)
     venv.seed(seed)

@@ -75,9 +75,13 @@ class PretrainSettings(Section):
 
 @dataclass(frozen=True)
 class LearnSettings(Section):
-    """Fine-tuning; `frames` are simulator frames, `env.step` calls times the action repeat."""
+    """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
+
+    `checkpoint_every` so many frames a killed run can go on from there; 0: only from the end.
+    """
 
     frames: int = 150_000
+    checkpoint_every: int = 10_000
 
 
 @dataclass(frozen=True)

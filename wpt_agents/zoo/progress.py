@@ -32,10 +32,13 @@ class LearningBar(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.bar is None:  # not sooner: retrieval and cloning have bars of their own
             total = self.locals["total_timesteps"] * self.frames_a_step
-            self.bar = progress(total, "learn", "frames")
+            done = self.model.num_timesteps * self.frames_a_step
+            self.bar = progress(total, "learn", "frames", done)
         self._move()
 
     def _on_step(self) -> bool:
+        frames = self.num_timesteps * self.frames_a_step
+        self.logger.record("time/frames", frames, exclude="tensorboard")
         return True
 
     def _on_training_end(self) -> None:

@@ -1,0 +1,184 @@
+"""A run that is killed goes on where it stood, and ends as if nothing had happened."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from debug_agent import same, weights
+from stable_baselines3.common.logger import configure
+from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
+
+from wpt_agents.model_file import read_model
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo import benchmark
+from wpt_agents.zoo.benchmark import run
+from wpt_agents.zoo.checkpoints import last_checkpoint
+from wpt_agents.zoo.evaluation import make_vec_env
+from wpt_agents.zoo.progress import LearningBar
+
+CHANGES = {
+    "learn": {"frames": 150, "checkpoint_every": 25},
+    "evaluate": {"episodes": 2, "every": 25, "during_episodes": 2, "keep_best": True},
+}
+
+
+class Killed(BaseException):
+    """What a SIGKILL is to the process, for one that the test has to outlive."""
+
+
+class KillAt(LearningBar):
+    def __init__(self, step):
+        super().__init__(frames_a_step=1)
+        self.step = step
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            raise Killed
+        return super()._on_step()
+
+
+def killed_at(step, monkeypatch, one):
+    """Does the run until `step`, and no more."""
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark, "LearningBar", lambda _: KillAt(step))
+        with pytest.raises(Killed):
+            run(one)
+
+
+def left(folder):
+    """All that a run leaves, clocks apart."""
+    _, tensors = read_model(folder / "model.zip")
+    flat = {f"{g}/{k}": v.numpy() for g, each in tensors.items() for k, v in each.items()}
+    rows = np.genfromtxt(folder / "progress.csv", delimiter=",", names=True)
+    flat |= {n: rows[n] for n in rows.dtype.names if n != "timefps"}
+    monitor = np.genfromtxt(folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
+    flat |= {"returns": monitor["r"], "lengths": monitor["l"]}
+    with np.load(folder / "evaluations.npz") as held:
+        flat |= {n: held[n] for n in held.files}
+    scores = json.loads((folder / "result.json").read_text())["scores"]
+    return flat | {name: np.array(score["returns"]) for name, score in scores.items()}
+
+
+def assert_equal(one, other):
+    assert one.keys() == other.keys()
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, other[name], err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["wpt", "scratch"])
+def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeypatch, capsys):
+    whole, broken = job(tmp_path / "whole", method, **CHANGES), job(tmp_path, method, **CHANGES)
+    run(whole)
+    for step in (40, 76, 149):
+        killed_at(step, monkeypatch, broken)
+    run(broken)
+    assert "continued at 125 of" in capsys.readouterr().out
+    assert_equal(left(broken.folder), left(whole.folder))
+    assert not (broken.folder / "replay").exists()
+
+
+def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+        with pytest.raises(Killed):
+            run(one)
+    before = weights(WPT.load(one.folder / "model.zip"))
+    monkeypatch.setattr("wpt_agents.wpt.WPT.update", lambda *_: pytest.fail("learns again"))
+    run(one)
+    assert same(weights(WPT.load(one.folder / "model.zip")), before)
+
+
+def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    names = sorted(path.name for path in (one.folder / "checkpoints").iterdir())
+    assert names == ["step-000000075", "step-000000100"]
+    damaged = one.folder / "checkpoints" / names[1] / "model.zip"
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
+    with pytest.warns(UserWarning, match="step-000000100 is damaged"):
+        assert last_checkpoint(one.folder).folder.name == names[0]
+
+
+def test_what_came_after_the_checkpoint_is_forgotten(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    shutil.rmtree(one.folder / "checkpoints" / "step-000000100")
+    checkpoint = last_checkpoint(one.folder)
+    checkpoint.restore_logs(one.folder)
+    assert (one.folder / "0.monitor.csv").read_text().count("\n") == 2 + 3
+    with np.load(one.folder / "evaluations.npz") as held:
+        assert held["timesteps"].tolist() == [25, 50, 75]
+    model = WPT.load(checkpoint.model)
+    model.set_logger(configure(str(tmp_path / "log"), []))
+    assert len(list((one.folder / "replay").iterdir())) == 4
+    checkpoint.restore(model, one.folder)
+    assert (
+        len(list((one.folder / "replay").iterdir())) == len(model.replay_buffer.trajectories) == 3
+    )
+
+
+def test_a_run_that_another_process_works_on_is_refused(tmp_path):
+    one = job(tmp_path)
+    one.folder.mkdir(parents=True)
+    with benchmark.locked(one.folder), pytest.raises(ValueError, match="by another process"):
+        run(one)
+
+
+def test_an_unfinished_run_of_other_settings_is_refused(tmp_path, monkeypatch):
+    killed_at(60, monkeypatch, job(tmp_path, **CHANGES))
+    with pytest.raises(ValueError, match=r"other settings.*wpt"):
+        run(job(tmp_path, wpt={"gamma": 0.9}, **CHANGES))
+
+
+def test_an_episode_depends_on_its_number_and_on_none_before_it():
+    settings = {"action_repeat": 1, "rendering": "fast"}
+    one, other = (make_vec_env(DOT.id, settings, seed=3) for _ in range(2))
+    images = [one.reset() for _ in range(4)]
+    assert len({image.tobytes() for image in images}) == 4
+    other.env_method("go_to_episode", 2)
+    np.testing.assert_array_equal(other.reset(), images[2])
+    np.testing.assert_array_equal(other.reset(), images[3])
+
+
+SCRIPT = """
+import sys; sys.path.insert(0, {tests!r})
+from pathlib import Path
+import test_zoo, gymnasium
+from wpt_envs.tasks import TASKS
+from test_zoo_resume import CHANGES
+TASKS[test_zoo.DOT.id] = test_zoo.DOT
+gymnasium.register(test_zoo.DOT.id, entry_point=test_zoo.make_dot)
+test_zoo.run(test_zoo.job(Path({out!r}), **CHANGES))
+"""
+
+
+def test_sigkill_at_random_moments_costs_nothing_that_was_kept(tmp_path):
+    whole, broken = job(tmp_path / "whole", **CHANGES), job(tmp_path / "broken", **CHANGES)
+    run(whole)
+    script = SCRIPT.format(tests=str(Path(__file__).parent), out=str(tmp_path / "broken"))
+    rng, kills = random.Random(0), 0
+    while not (broken.folder / "result.json").exists():
+        child = subprocess.Popen(
+            [sys.executable, "-c", script],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        patience = rng.uniform(4, 12) if kills < 5 else 300  # importing alone takes seconds
+        try:
+            _, said = child.communicate(timeout=patience)
+            assert child.returncode == 0, said.decode()
+        except subprocess.TimeoutExpired:
+            child.send_signal(signal.SIGKILL)
+            child.communicate()
+            kills += 1
+    assert_equal(left(broken.folder), left(whole.folder))
+    assert kills

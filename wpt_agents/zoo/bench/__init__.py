@@ -1,0 +1,1 @@
+"""What the library costs, measured: one module a subject, each with `rows`."""

@@ -1,5 +1,6 @@
 """The table of tasks, and what importing the package does."""
 
+import inspect
 import re
 import subprocess
 import sys
@@ -7,7 +8,8 @@ import sys
 import gymnasium as gym
 import pytest
 import wpt_envs
-from wpt_envs import tasks
+from wpt_envs import dmc, metaworld, robotics, tasks
+from wpt_envs.simulated import Simulated
 
 from wpt_agents.zoo import __main__ as command_line
 
@@ -68,6 +70,27 @@ def test_the_zoo_prints_the_table(monkeypatch, capsys):
         paper = "yes" if row.in_paper else "no"
         name = f"{row.suite}-{row.name}"
         assert (name, row.embodiment, *numbers, row.metric, paper) in told
+
+
+FAMILIES = {dmc: dmc.DMControl, metaworld: metaworld.MetaWorld, robotics: robotics.Robotics}
+HEADINGS = (
+    "Description, Action Space, Observation Space, Rewards, Starting State, Episode End, "
+    "Arguments, Version History"
+)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values())
+def test_a_family_is_described_in_gymnasiums_form(family):
+    assert re.findall("## (.*)", family.__doc__) == HEADINGS.split(", ")
+
+
+@pytest.mark.parametrize(("module", "family"), FAMILIES.items())
+def test_every_keyword_of_a_family_is_described_and_no_other(module, family):
+    own = family.__doc__.split("## Arguments")[1].split("## Version")[0]
+    told = re.findall(r"`(\w+)(?:=[^`]*)?`", Simulated.__doc__.split("## Arguments")[1] + own)
+    given = inspect.signature(module.make).parameters.keys() - {"task"}
+    assert given <= set(told)
+    assert set(re.findall(r"- `(\w+)", Simulated.__doc__ + own)) <= given
 
 
 def test_an_unknown_suite_is_answered_with_all_suites():

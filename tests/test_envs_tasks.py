@@ -4,6 +4,7 @@ import inspect
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -101,3 +102,14 @@ def test_an_unknown_suite_is_answered_with_all_suites():
 def test_a_padding_which_is_no_number_is_refused():
     with pytest.raises(ValueError, match="'suite'"):
         tasks.pad_width("dmc", "widest")
+
+
+def test_the_pages_example_runs():
+    page = (Path(__file__).parents[1] / "docs" / "envs.md").read_text()
+    code = re.search(r"```python\n(.*?)```", page, re.S)[1]
+    several = 'num_envs=4, vectorization_mode="async"'
+    assert several in code
+    exec(code.replace(several, "num_envs=1"), left := {})
+    assert left["env"].action_space.shape == (12,)
+    assert left["envs"].single_action_space.shape == (4,)
+    assert left["pole"].reset(seed=0)[0].shape == (64, 64, 3)

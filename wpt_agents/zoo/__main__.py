@@ -1,4 +1,4 @@
-"""The commands: python -m wpt_agents.zoo {list, collect, pretrain, run, report}.
+"""The commands: python -m wpt_agents.zoo {list, collect, pretrain, run, report, bench}.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
+
+from wpt_agents.zoo.bench.command import bench
 
 app = typer.Typer(
     add_completion=False,
@@ -198,6 +200,9 @@ def report_results(
         typer.echo(report.markdown(rows), nl=False)
     else:
         console.print(report.summary_table(rows))
+
+
+app.command("bench")(bench)
 
 
 def main() -> None:

@@ -1,0 +1,1 @@
+"""What one update, one action and one batch cost, as measured on this machine."""

@@ -1,4 +1,4 @@
-"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report}, and `data_commands`.
+"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report, bench}, and `data_commands`.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from wpt_agents.zoo import data_commands
+from wpt_agents.zoo.bench.command import bench
 from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
 
 app = typer.Typer(
@@ -168,6 +169,9 @@ def report_results(
         page.with_name("policies.csv").write_text(report.policy_csv(policies))
         console.print(report.summary_table(rows))
         console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
+
+
+app.command("bench")(bench)
 
 
 def main() -> None:

@@ -77,7 +77,7 @@ COUNTED = [name for name, task in wpt_envs.TASKS.items() if task.in_paper]
 @pytest.mark.parametrize("name", COUNTED)
 def test_near_looks_like_exact_on_each_of_the_72(name):
     """One state; the mean over 20, 38 dB and more, is what `python -m wpt_envs likeness` shows."""
-    assert measure.likeness(wpt_envs.TASKS[name], states=1)["near"] >= 36
+    assert measure.likeness(wpt_envs.TASKS[name], states=1)["near"] >= 37
 
 
 def test_no_environment_changes_anothers_frames():

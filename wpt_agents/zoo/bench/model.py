@@ -13,9 +13,11 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.timing import ceiling, gflop, peak_rss_mb, seconds
 
 ACTIONS = 6
-CASES = (
-    *(("tiny", 16, 8), ("tiny", 16, 64), ("small", 16, 64)),
-    *(("small", 16, 16), ("small", 4, 64), ("medium", 16, 64)),
+CASES = (  # size, batch, length: what grows with each, then what the paper's batch costs
+    *((size, 16, 16) for size in ("debug", "tiny", "small", "medium")),
+    *(("tiny", batch, 16) for batch in (4, 8, 32)),
+    *(("tiny", 16, length) for length in (8, 32, 64)),
+    ("small", 16, 64),
 )
 
 
@@ -32,7 +34,7 @@ def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iter
             ("world model", world_model_step(model, data), params[0]),
             ("whole update", whole_step(model, data), sum(params)),
         ):
-            yield measured(step, about | {"what": what, "params": count}, 1 if quick else 5)
+            yield measured(step, about | {"what": what, "params": count}, 1 if quick else 3)
 
 
 def measured(step: Callable[[], Any], about: dict[str, Any], repetitions: int) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from wpt_agents.networks import FromPixel, UpConv
 
 
-def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 2) -> tuple[float, float]:
+def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple[float, float]:
     """The medians of `step`'s processor time (this process, all threads) and of its wall-clock.
 
     :param warmup: calls that are not counted: memory is fetched and caches fill

@@ -26,6 +26,7 @@ from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout
 from wpt_agents.trajectory import Trajectory
+from wpt_agents.updates import PRETRAIN
 from wpt_agents.wpt import WPT
 
 
@@ -90,6 +91,22 @@ def test_pretraining_calls_back_after_every_update_with_finite_metrics(store):
     pretrained(store, steps=3, callback=lambda step, metrics: seen.append((step, metrics)))
     assert [step for step, _ in seen] == [1, 2, 3]
     assert all("train/kl" in m and np.isfinite(list(m.values())).all() for _, m in seen)
+
+
+def test_pretraining_prepares_batches_ahead_and_draws_them_by_seed_and_step(store, monkeypatch):
+    seen, update = [], WPT._update_world_model
+
+    def watch(self, batch, *rest):
+        seen.append(batch)
+        update(self, batch, *rest)
+
+    monkeypatch.setattr(WPT, "_update_world_model", watch)
+    model = pretrained(store, steps=3)
+    shape = model.batch_size, model.batch_length, model.max_action_dim
+    for step, batch in enumerate(seen):
+        drawn = store.sample(*shape, rng=np.random.default_rng([model.stream_seed, PRETRAIN, step]))
+        assert batch.image.equal(drawn.image) and batch.action.equal(drawn.action)
+    assert len(seen) == 3
 
 
 def test_pretraining_shows_the_time_left(store, capfd):

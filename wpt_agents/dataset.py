@@ -11,7 +11,7 @@ Example::
 import hashlib
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
@@ -314,9 +314,10 @@ class TrajectoryDataset(Conversions):
         start: int = 0,
         ahead: int = 2,
         pin: bool = False,
-    ) -> Iterator[Batch]:
+    ) -> Generator[Batch, None, None]:
         """Batches without end, from number `start`; batch k depends on (seed, rank, k) alone.
 
+        :param rank: another for each process, or purpose, that shares the seed
         :param ahead: how many are prepared in the background
         :param pin: put them into pinned memory, from which a GPU copies while it computes
         """

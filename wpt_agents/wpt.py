@@ -15,6 +15,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -311,15 +312,15 @@ class WPT(Updates, Saving, BaseAlgorithm):
     ) -> None:
         assert self.dataset is not None
         done = self.pretrain_steps
+        shape = self.batch_size, self.batch_length, self.max_action_dim
+        pin = self.device.type == "cuda"
+        batches = self.dataset.batches(*shape, self.stream_seed, PRETRAIN, start=done, pin=pin)
         bar = tqdm(total=steps, initial=done, desc="pre-train", disable=not progress_bar)
-        with bar:
-            for step in range(done, steps):
-                rng = self._stream(PRETRAIN, step)
-                batch = self.dataset.sample(
-                    self.batch_size, self.batch_length, self.max_action_dim, rng
-                ).to(self.device)
+        with bar, closing(batches):
+            for step, batch in zip(range(done, steps), batches, strict=False):
                 metrics: dict[str, list[Tensor]] = defaultdict(list)
-                self._update_world_model(batch, metrics, self._generator(PRETRAIN, step))
+                generator = self._generator(PRETRAIN, step)
+                self._update_world_model(batch.to(self.device), metrics, generator)
                 self.pretrain_steps = step + 1
                 if callback is not None:
                     callback(self.pretrain_steps, {k: float(v[0]) for k, v in metrics.items()})

@@ -168,6 +168,18 @@ def test_merge_makes_a_dataset_of_several(tmp_path):
     assert [len(part) for part in parts] == [2, 2]
 
 
+@pytest.mark.parametrize(
+    ("codecs", "codec"),
+    [(("raw", "raw"), "raw"), (("jpeg", "raw"), "zstd"), (("jpeg", "jpeg"), "jpeg")],
+)
+def test_merging_loses_no_more_than_was_lost(tmp_path, codecs, codec):
+    parts = [made(tmp_path / str(n), chain(40, n), codec=c) for n, c in enumerate(codecs)]
+    merged = TrajectoryDataset.merge(tmp_path / "all", parts)
+    assert merged.info()["codec"] == codec
+    for trajectory, part in zip(merged, parts, strict=True):
+        np.testing.assert_array_equal(trajectory.image, part[0].image)
+
+
 def test_merge_refuses_nothing_and_other_sizes_before_it_writes(tmp_path):
     small, large = made(tmp_path / "1", chain(3)), TrajectoryDataset.create(tmp_path / "2")
     with pytest.raises(ValueError, match=r"one image size: .*1 has 8, .*2 has 64"):

@@ -142,6 +142,17 @@ def test_a_disk_that_fills_up_at_any_write_leaves_the_dataset_as_it_was(tmp_path
         np.testing.assert_array_equal(trajectory.image, chain(40, seed).image)
 
 
+def test_a_disk_that_fills_up_while_another_dataset_is_copied_is_not_called_damage(tmp_path):
+    with TrajectoryDataset.open(empty(tmp_path / "1")) as other:
+        other.extend(chain(40, seed) for seed in range(3))
+    with TrajectoryDataset.open(empty(tmp_path / "2")) as dataset:
+        dataset.append(chain(40, 9))
+        with pytest.raises(OSError, match="No space"), failing(6, no_space, random.Random(0)):
+            dataset.extend(other)
+        assert len(dataset) == len(TrajectoryDataset.open(tmp_path / "2")) == 2
+    assert TrajectoryDataset.open(tmp_path / "2").validate() == []
+
+
 def mount(source, target, kind, flags, data=None):
     if ctypes.CDLL(None, use_errno=True).mount(source, target, kind, flags, data):
         os._exit(NO_MOUNTS)

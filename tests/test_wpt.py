@@ -204,7 +204,7 @@ def test_a_subset_has_an_index_of_its_own(store):
         np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
     model.set_dataset(store)
     whole = np.concatenate(list(store.first_observations()))
-    np.testing.assert_array_equal(model.build_index().features, model.embed(whole))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(whole))
 
 
 def test_an_index_of_other_trajectories_is_built_anew(store):
@@ -219,7 +219,7 @@ def test_an_index_of_other_trajectories_is_built_anew(store):
         store.append(recorded(seed=9))  # as many as before
     assert len(store) == 6
     first = np.concatenate(list(store.first_observations()))
-    np.testing.assert_array_equal(model.build_index().features, model.embed(first))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
 
 
 def test_an_index_that_cannot_be_written_is_kept_in_memory(store, monkeypatch):

@@ -31,7 +31,7 @@ from wpt_agents.index import (
     read_meta,
     undamaged,
 )
-from wpt_agents.shards import BLOCK, Writer, read_steps
+from wpt_agents.shards import BLOCK, Writer, read_blocks, read_steps
 from wpt_agents.trajectory import IMAGE_SIZE, Batch, Trajectory
 from wpt_agents.windows import Piece, Windows, make_batch
 
@@ -87,8 +87,8 @@ class TrajectoryDataset(Conversions):
     ) -> "TrajectoryDataset":
         """Makes an empty dataset in a new or empty folder.
 
-        :param codec: "zstd" (lossless, a tenth to a fifth of simulated images), "raw" or "jpeg"
-            (lossy, quality 95: a fourth of noisy camera images, of which zstd makes little)
+        :param codec: "zstd" (lossless, about a sixth of simulated images), "raw" or "jpeg" (lossy,
+            about a fourth, for noisy images, as of cameras, which zstd does not halve)
         :raises ValueError: an unknown codec, or a folder with something in it
         """
         find_codec(codec)
@@ -115,6 +115,8 @@ class TrajectoryDataset(Conversions):
     ) -> "TrajectoryDataset":
         """Makes a new dataset of all trajectories of `datasets`, in their order.
 
+        Its codec is theirs, or "zstd" if they differ, so that nothing more is lost.
+
         :raises ValueError: no datasets, images of different sizes, a folder with something in it,
             or a damaged trajectory; those before it are kept
         """
@@ -122,8 +124,8 @@ class TrajectoryDataset(Conversions):
         if len({meta.image_size for meta in metas}) != 1:
             found = ", ".join(f"{path} has {meta.image_size}" for meta, path in metas.items())
             raise ValueError(f"merge wants datasets of one image size: {found or 'none given'}")
-        meta = next(iter(metas))
-        with cls.create(path, meta.image_size, meta.codec) as merged:
+        size, codecs = next(iter(metas)).image_size, {meta.codec for meta in metas}
+        with cls.create(path, size, codecs.pop() if len(codecs) == 1 else "zstd") as merged:
             for dataset in datasets:
                 merged.extend(dataset)
         return cls.open(path, workers)
@@ -165,10 +167,11 @@ class TrajectoryDataset(Conversions):
         writer = other._begin()
         for i, entry in enumerate(list(self._entries)):
             try:
-                other._entries.append(writer.copy(self.path, entry))
+                blocks = list(read_blocks(self.path, entry, 0, len(entry.sizes) - 1))
             except OSError as error:
                 raise self._damaged(i, error) from error
-        other._windows = None
+            other._entries.append(writer.copy(blocks, entry))
+            other._windows = None
 
     def _begin(self) -> Writer:
         """The right to write, taken at the first append; what others appended is seen then."""

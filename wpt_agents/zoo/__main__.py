@@ -1,4 +1,4 @@
-"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report}, and `data_commands`.
+"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report, bench}, and `data_commands`.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from wpt_agents.zoo import data_commands
+from wpt_agents.zoo.bench.command import bench
 from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
 
 app = typer.Typer(
@@ -134,24 +135,43 @@ def report_results(
     ),
     markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
     csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
+    ] = None,
+    media: Annotated[
+        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
+    ] = "first",
 ) -> None:
-    """Shows the mean over seeds of every task and method, with its 95 % interval.
+    """Shows the mean over seeds of every task and method, and writes a page about all runs.
 
-    Markdown and CSV also have every policy: doing nothing, random, prior actor, WPT.
+    The page is one file that needs no network: the paper's tables beside yours, aggregates with
+    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
+    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
+    prior actor, WPT.
     """
     from wpt_agents.zoo import report
+    from wpt_agents.zoo.page import write_page
     from wpt_agents.zoo.stages import console
 
     results = report.read_results(folder)
     if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows, policies = report.summarise(results), report.policies(results)
+    as_markdown = f"{report.markdown(rows)}\n{report.policy_markdown(policies)}"
     if csv:
         typer.echo(report.policy_csv(policies), nl=False)
     elif markdown:
-        typer.echo(f"{report.markdown(rows)}\n{report.policy_markdown(policies)}", nl=False)
+        typer.echo(as_markdown, nl=False)
     else:
+        page = (out or folder / "report") / "index.html"
+        write_page(folder, page, media)
+        page.with_name("report.md").write_text(as_markdown)
+        page.with_name("policies.csv").write_text(report.policy_csv(policies))
         console.print(report.summary_table(rows))
+        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
+
+
+app.command("bench")(bench)
 
 
 def main() -> None:

@@ -108,7 +108,7 @@ class _Blank:
     """As much of a dataset as the index looks at: black first images."""
 
     def __init__(self, length: int) -> None:
-        self.length, self.embodiments = length, [None] * length
+        self.length, self.embodiments, self.fingerprint = length, [None] * length, "blank"
         self.action_dims = np.full(length, 6)
 
     def __len__(self) -> int:

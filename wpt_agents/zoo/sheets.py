@@ -1,7 +1,7 @@
 """A look at the data: table and contact sheet of a dataset, and a sheet of what is retrieved."""
 
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -76,11 +76,11 @@ def spread(dataset: TrajectoryDataset, number: int) -> list[int]:
     if number <= len(groups):
         at = np.linspace(0, len(groups) - 1, number).round().astype(int)
         return [list(groups.values())[i][0] for i in at]
-    share, more = divmod(number, len(groups))
+    turns = sorted((turn, at) for at, ids in enumerate(groups.values()) for turn in range(len(ids)))
+    wanted = Counter(at for _, at in turns[:number])
     chosen = []
     for at, ids in enumerate(groups.values()):
-        wanted = min(share + (at < more), len(ids))
-        chosen += [ids[int(i)] for i in np.linspace(0, len(ids) - 1, wanted).round()]
+        chosen += [ids[int(i)] for i in np.linspace(0, len(ids) - 1, wanted[at]).round()]
     return chosen
 
 
@@ -108,7 +108,7 @@ def query_of(dataset: TrajectoryDataset, i: int) -> Query:
     if not 0 <= i < len(dataset):
         raise ValueError(f"No trajectory {i}: {dataset.path} holds {len(dataset)}, from 0 on")
     trajectory = dataset[i]
-    name = f"#{i}\n{_short(trajectory.task) or trajectory.embodiment or ''}"
+    name = f"#{i}\n{_kind(trajectory.task, trajectory.embodiment)}"
     return Query(name, trajectory.image[0], trajectory.embodiment, trajectory.action_dim, i)
 
 
@@ -117,7 +117,7 @@ def query_at(task: Task, rendering: str) -> Query:
     env = gym.make(task.id, rendering=rendering)
     image, _ = env.reset(seed=0)
     env.close()
-    return Query(f"first image of\n{task.name}", image, task.embodiment, task.action_dim)
+    return Query(f"first image of\n{_cut(task.name, 18)}", image, task.embodiment, task.action_dim)
 
 
 def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
@@ -147,8 +147,9 @@ def retrieval_sheet(
             same = query.embodiment is not None and robot == query.embodiment
             first = next(dataset.subset([i]).first_observations())[0]
             _draw(axis, first, COLOURS["WPT"] if same else COLOURS["prior actor"], 2)
-            name = _cut(_short(task) or robot or "", 18)
-            axis.set_title(f"#{i}  d {distance:.2f}\n{name}", fontsize=6.5, color=INK, pad=3)
+            axis.set_title(
+                f"#{i}  d {distance:.2f}\n{_kind(task, robot)}", fontsize=6.5, color=INK, pad=3
+            )
     robots = "blue: the query's own robot, orange: another"
     _finish(figure, path, f"First images and the nearest in {dataset.path} ({robots})")
 
@@ -168,6 +169,12 @@ def _finish(figure: plt.Figure, path: str | os.PathLike[str], title: str) -> Non
 
 def _short(task: str | None) -> str | None:
     return task.removeprefix("wpt/").removesuffix("-v0") if task else None
+
+
+def _kind(task: str | None, embodiment: str | None) -> str:
+    """The task without its suite, or the robot, in a few letters."""
+    suite, _, name = (_short(task) or "").partition("-")
+    return _cut(name or suite or embodiment or "", 18)
 
 
 def _cut(text: str, width: int = 30) -> str:

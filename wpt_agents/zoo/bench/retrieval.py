@@ -93,18 +93,22 @@ def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> 
         chance[row.suite].append(float(same.mean()))
     return {
         "queries": len(asked.task),
-        "own robot, DMControl": round(float(np.mean(own["dmc"])), 3),
-        "by chance": round(float(np.mean(chance["dmc"])), 3),
-        "own task, Meta-World": round(float(np.mean(own["metaworld"])), 3),
-        "by chance ": round(float(np.mean(chance["metaworld"])), 3),
+        "own robot, DMControl": _mean(own["dmc"]),
+        "by chance": _mean(chance["dmc"]),
+        "own task, Meta-World": _mean(own["metaworld"]),
+        "by chance ": _mean(chance["metaworld"]),
     }
+
+
+def _mean(values: list[float]) -> float | None:
+    return round(float(np.mean(values)), 3) if values else None
 
 
 class _Blank:
     """As much of a dataset as the index looks at: black first images."""
 
     def __init__(self, length: int) -> None:
-        self.length, self.embodiments = length, [None] * length
+        self.length, self.embodiments, self.fingerprint = length, [None] * length, "blank"
         self.action_dims = np.full(length, 6)
 
     def __len__(self) -> int:

@@ -12,12 +12,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = [
     {"trajectory", "distributions", "networks", "guidance", "archive", "names", "codecs"},
-    {"windows", "index", "shards", "model_file", "scan"},
+    {"windows", "index", "shards", "model_file", "scan", "importers"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
-    {"retrieval", "importers", "world_model", "checks"},
+    {"retrieval", "world_model", "checks"},
     {"policy"},
     {"rollout", "updates", "saving"},
     {"wpt"},
+    {"exploration"},
     {"zoo"},
 ]
 

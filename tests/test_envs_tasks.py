@@ -1,13 +1,16 @@
 """The table of tasks, and what importing the package does."""
 
+import inspect
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
 import wpt_envs
-from wpt_envs import tasks
+from wpt_envs import dmc, metaworld, robotics, tasks
+from wpt_envs.simulated import Simulated
 
 from wpt_agents.zoo import __main__ as command_line
 
@@ -70,6 +73,27 @@ def test_the_zoo_prints_the_table(monkeypatch, capsys):
         assert (name, row.embodiment, *numbers, row.metric, paper) in told
 
 
+FAMILIES = {dmc: dmc.DMControl, metaworld: metaworld.MetaWorld, robotics: robotics.Robotics}
+HEADINGS = (
+    "Description, Action Space, Observation Space, Rewards, Starting State, Episode End, "
+    "Arguments, Version History"
+)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values())
+def test_a_family_is_described_in_gymnasiums_form(family):
+    assert re.findall("## (.*)", family.__doc__) == HEADINGS.split(", ")
+
+
+@pytest.mark.parametrize(("module", "family"), FAMILIES.items())
+def test_every_keyword_of_a_family_is_described_and_no_other(module, family):
+    own = family.__doc__.split("## Arguments")[1].split("## Version")[0]
+    told = re.findall(r"`(\w+)(?:=[^`]*)?`", Simulated.__doc__.split("## Arguments")[1] + own)
+    given = inspect.signature(module.make).parameters.keys() - {"task"}
+    assert given <= set(told)
+    assert set(re.findall(r"- `(\w+)", Simulated.__doc__ + own)) <= given
+
+
 def test_an_unknown_suite_is_answered_with_all_suites():
     with pytest.raises(ValueError, match="dmc, metaworld, robotics"):
         tasks.suite("dcm")
@@ -78,3 +102,14 @@ def test_an_unknown_suite_is_answered_with_all_suites():
 def test_a_padding_which_is_no_number_is_refused():
     with pytest.raises(ValueError, match="'suite'"):
         tasks.pad_width("dmc", "widest")
+
+
+def test_the_pages_example_runs():
+    page = (Path(__file__).parents[1] / "docs" / "envs.md").read_text()
+    code = re.search(r"```python\n(.*?)```", page, re.S)[1]
+    several = 'num_envs=4, vectorization_mode="async"'
+    assert several in code
+    exec(code.replace(several, "num_envs=1"), left := {})
+    assert left["env"].action_space.shape == (12,)
+    assert left["envs"].single_action_space.shape == (4,)
+    assert left["pole"].reset(seed=0)[0].shape == (64, 64, 3)

@@ -13,6 +13,8 @@ from dm_control.rl.control import PhysicsError
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 from wpt_envs.wrappers import CheckAction, PadAction, RepeatAction, SeePixels
 
 SUITES = ["dmc-walker-run", "metaworld-button-press", "robotics-fetch-push"]
@@ -201,6 +203,20 @@ def test_a_spawned_worker_knows_the_ids_too():
     name, spawned = "wpt/dmc-cartpole-balance-v0", {"context": "spawn"}
     vector = gym.make_vec(name, 1, "async", vector_kwargs=spawned, rendering="fast")
     first, _ = vector.reset(seed=0)
+    vector.close()
+    assert np.array_equal(first[0], gym.make(name, rendering="fast").reset(seed=0)[0])
+
+
+def test_workers_of_stable_baselines3_know_the_ids_by_the_packages_name():
+    name = "wpt/dmc-cartpole-balance-v0"
+    vector = make_vec_env(
+        f"wpt_envs:{name}",
+        seed=0,
+        vec_env_cls=SubprocVecEnv,
+        env_kwargs={"rendering": "fast"},
+        vec_env_kwargs={"start_method": "spawn"},
+    )
+    first = vector.reset()
     vector.close()
     assert np.array_equal(first[0], gym.make(name, rendering="fast").reset(seed=0)[0])
 

@@ -2,19 +2,25 @@
 
 import io
 import json
+import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from chain import chain, follows
+from debug_agent import pretrained
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from PIL import Image
 from stable_baselines3.common.buffers import ReplayBuffer as SB3Buffer
+from stable_baselines3.common.save_util import save_to_pkl
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.importers.convert import convert, open_episodes
+from wpt_agents.importers.convert import cache_folder, open_episodes, recognise
 from wpt_agents.importers.episodes import as_images, needs, rescaled
 from wpt_agents.importers.npz import NpzEpisodes
 from wpt_agents.importers.sb3 import SB3Episodes
+from wpt_agents.zoo import __main__ as command_line
 
 SMALL = {"image_size": 8, "rewards": True}
 
@@ -142,6 +148,14 @@ def test_a_truncated_npz_is_named(tmp_path, share):
     [
         ({"observation": np.zeros((4, 24), np.float32), "action": np.zeros((4, 2))}, "render"),
         ({"pixels": np.zeros((4, 8, 8, 3), np.uint8), "action": np.zeros((3, 2))}, "equally many"),
+        (
+            {
+                "image": np.zeros((4, 8, 8, 3), np.uint8),
+                "action": np.zeros((4, 2)),
+                "is_first": np.array([1, 0, 1, 0], bool),
+            },
+            "parts of several episodes",
+        ),
         ({"state": np.zeros(3)}, "holds nothing known; an episode needs 'action'"),
         ({"image": np.zeros((4, 8, 8, 3), np.uint8), "action": np.full((4, 2), 9.0)}, "rescale"),
     ],
@@ -166,10 +180,10 @@ def test_a_conversion_that_was_cut_short_goes_on_where_it_stopped(tmp_path):
     save_npz(tmp_path / "in/2.npz", chain(2), key="nonsense")
     episodes = NpzEpisodes(tmp_path / "in", **SMALL)
     with pytest.raises(ValueError, match=r"2\.npz holds"):
-        convert(episodes, tmp_path / "out")
+        TrajectoryDataset.from_episodes(episodes, tmp_path / "out")
     assert len(TrajectoryDataset.open(tmp_path / "out")) == 2
     save_npz(tmp_path / "in/2.npz", chain(7, 2))
-    convert(episodes, tmp_path / "out")
+    TrajectoryDataset.from_episodes(episodes, tmp_path / "out")
     dataset = TrajectoryDataset.open(tmp_path / "out")
     assert dataset.lengths.tolist() == [5, 6, 7, 8]
     for seed, trajectory in enumerate(dataset):
@@ -179,19 +193,82 @@ def test_a_conversion_that_was_cut_short_goes_on_where_it_stopped(tmp_path):
 def test_a_dataset_of_another_source_is_not_added_to(tmp_path):
     for folder, name in (("a", "1"), ("b", "2")):
         save_npz(tmp_path / folder / f"{name}.npz", chain(5))
-    convert(NpzEpisodes(tmp_path / "a", **SMALL), tmp_path / "out")
+    TrajectoryDataset.from_npz(tmp_path / "a", tmp_path / "out", **SMALL)
     with pytest.raises(ValueError, match="1 trajectories of another source"):
-        convert(NpzEpisodes(tmp_path / "b", **SMALL), tmp_path / "out")
+        TrajectoryDataset.from_npz(tmp_path / "b", tmp_path / "out", **SMALL)
+
+
+def test_a_conversion_does_not_go_on_under_another_label(tmp_path):
+    for i in range(2):
+        save_npz(tmp_path / f"in/{i}.npz", chain(5, i))
+    (tmp_path / "in/1.npz").rename(tmp_path / "1.npz")
+    TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", embodiment="walker", **SMALL)
+    (tmp_path / "1.npz").rename(tmp_path / "in/1.npz")
+    with pytest.raises(ValueError, match="other labels; convert to another folder"):
+        TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", embodiment="ant", **SMALL)
+    done = TrajectoryDataset.from_npz(
+        tmp_path / "in", tmp_path / "out", embodiment="walker", **SMALL
+    )
+    assert done.embodiments == ["walker", "walker"]
+
+
+def test_a_format_or_option_that_is_mistyped_is_answered_with_the_nearest(tmp_path):
+    with pytest.raises(ValueError, match=r"No format 'lerobt'\. Did you mean 'lerobot'"):
+        TrajectoryDataset.from_episodes(open_episodes(tmp_path, "lerobt"), tmp_path / "out")
+    with pytest.raises(ValueError, match=r"No option for npz 'image_kye'\. Did you mean 'image_"):
+        TrajectoryDataset.from_npz(tmp_path, tmp_path / "out", image_kye="pixels")
+
+
+# Straight from the files
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "wpt_agents"
+
+
+def test_a_folder_of_npz_is_converted_once_and_anew_when_a_file_changes(tmp_path, cache):
+    save_npz(tmp_path / "in/0.npz", chain(5, 0, size=64))
+    first = TrajectoryDataset.of(tmp_path / "in")
+    assert first.path == cache_folder(tmp_path / "in") and first.path.parent == cache
+    written = [p.stat().st_mtime_ns for p in sorted(first.path.iterdir())]
+    again = TrajectoryDataset.of(str(tmp_path / "in"))
+    assert [p.stat().st_mtime_ns for p in sorted(again.path.iterdir())] == written
+    save_npz(tmp_path / "in/1.npz", chain(6, 1, size=64))
+    assert TrajectoryDataset.of(tmp_path / "in").lengths.tolist() == [5, 6]
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_pretraining_takes_whatever_can_be_read(tmp_path, cache, monkeypatch):
+    pictures = [chain(9, 0, size=64), chain(8, 1, size=64)]
+    save_npz(tmp_path / "npz/0.npz", pictures[0])
+    save_hdf5(tmp_path / "data.h5", [chain(9, 0, size=64)], with_next=True, scale=1)
+    buffer = sb3_buffer(pictures, 30, size=64)
+    store = TrajectoryDataset.from_npz(tmp_path / "npz", tmp_path / "store")
+    for data in (tmp_path / "npz", tmp_path / "data.h5", buffer, store, store.path, pictures):
+        model = pretrained(data, steps=1)
+        assert model.pretrain_steps == 1
+        np.testing.assert_array_equal(model.dataset[0].image, pictures[0].image)
+
+
+def test_our_own_store_is_no_foreign_format(tmp_path):
+    save_npz(tmp_path / "in/0.npz", chain(5))
+    TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", **SMALL)
+    assert recognise(tmp_path / "out") is None
+    assert recognise(tmp_path / "in") == "npz"
+    with pytest.raises(ValueError, match="nowhere does not exist"):
+        TrajectoryDataset.of(tmp_path / "nowhere")
 
 
 # SB3: the action was taken at the observation
 
 
-def sb3_buffer(trajectories, size, channels_first=True, **kwargs):
+def sb3_buffer(trajectories, length, channels_first=True, size=8, **kwargs):
     """Fills a buffer of SB3 with whole trajectories, one environment."""
-    shape = (3, 8, 8) if channels_first else (8, 8, 3)
+    shape = (3, size, size) if channels_first else (size, size, 3)
     image_space = gym.spaces.Box(0, 255, shape, np.uint8)
-    buffer = SB3Buffer(size, image_space, gym.spaces.Box(-1, 1, (2,)), "cpu", **kwargs)
+    buffer = SB3Buffer(length, image_space, gym.spaces.Box(-1, 1, (2,)), "cpu", **kwargs)
     for trajectory in trajectories:
         order = (0, 3, 1, 2) if channels_first else (0, 1, 2, 3)
         image, last = trajectory.image.transpose(order), len(trajectory) - 1
@@ -234,19 +311,36 @@ def test_a_buffer_that_saves_memory_has_lost_each_last_observation(size):
     np.testing.assert_array_equal(new[-2].image, old[1].image[:7])
 
 
-def test_only_a_replay_buffer_of_sb3_is_read():
-    with pytest.raises(ValueError, match=r"Expected a ReplayBuffer of SB3, got str"):
-        SB3Episodes("replay.pkl")
+def test_only_a_replay_buffer_of_sb3_is_read(tmp_path):
+    with pytest.raises(ValueError, match=r"Expected a ReplayBuffer of SB3, got list"):
+        SB3Episodes([])
+    save_to_pkl(tmp_path / "list.pkl", [1])
+    with pytest.raises(ValueError, match=r"Expected a ReplayBuffer of SB3, got list"):
+        SB3Episodes(tmp_path / "list.pkl", trust=True)
+
+
+def test_a_saved_replay_buffer_is_loaded_by_those_who_trust_it_only(tmp_path):
+    old = chain(5, 0, terminated=True)
+    save_to_pkl(tmp_path / "replay.pkl", sb3_buffer([old], 20))
+    with pytest.raises(ValueError, match=r"replay\.pkl is a pickle.*trust=True \(--trust\)"):
+        TrajectoryDataset.from_sb3(tmp_path / "replay.pkl", tmp_path / "out", **SMALL)
+    [new] = TrajectoryDataset.from_sb3(
+        tmp_path / "replay.pkl", tmp_path / "out", trust=True, **SMALL
+    )
+    check_same(new, old)
+    (tmp_path / "replay.pkl").write_bytes(b"\x80\x04half")
+    with pytest.raises(ValueError, match=r"replay\.pkl cannot be read as a replay buffer"):
+        SB3Episodes(tmp_path / "replay.pkl", trust=True)
 
 
 # HDF5 in D4RL's manner
 
 
-def save_hdf5(path, trajectories, with_next=False):
+def save_hdf5(path, trajectories, with_next=False, scale=3):
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
         file["observations"] = np.concatenate([t.image[:-1] for t in trajectories])
-        file["actions"] = np.concatenate([3 * t.action for t in trajectories])
+        file["actions"] = np.concatenate([scale * t.action for t in trajectories])
         file["rewards"] = np.concatenate([t.reward for t in trajectories])
         last = np.concatenate([np.arange(len(t)) == len(t) - 1 for t in trajectories])
         over = np.concatenate([np.full(len(t), t.terminated) for t in trajectories])
@@ -424,6 +518,7 @@ def write_video(path, states, fps):
         container.mux(stream.encode())
 
 
+@pytest.mark.filterwarnings("ignore:LeRobot stored")
 @pytest.mark.parametrize("video", [True, False])
 def test_lerobot_episodes_keep_to_the_chain_and_leave_each_last_action_out(tmp_path, video):
     save_lerobot(tmp_path, [6, 9, 1, 5], video)
@@ -439,6 +534,13 @@ def test_lerobot_episodes_keep_to_the_chain_and_leave_each_last_action_out(tmp_p
     assert (new[1].task, new[1].embodiment) == ("task 1", "so100")
 
 
+def test_that_lerobot_stored_video_is_warned_of(tmp_path):
+    save_lerobot(tmp_path, [6])
+    with pytest.warns(UserWarning, match="as video, which is lossy; record with dtype 'image'"):
+        TrajectoryDataset.from_lerobot(tmp_path, tmp_path / "out", **SMALL)
+
+
+@pytest.mark.filterwarnings("ignore:LeRobot stored")
 def test_a_lerobot_video_that_is_too_short_is_named(tmp_path):
     states = save_lerobot(tmp_path, [6, 9])
     (tmp_path / "videos/front/chunk-000/file-000.mp4").unlink()
@@ -457,3 +559,173 @@ def test_an_older_lerobot_version_and_a_camera_that_is_not_there_are_named(tmp_p
     write_lerobot_meta(tmp_path, False, 10, version="v2.1")
     with pytest.raises(ValueError, match=r"version v2\.1; convert it to v3\.0"):
         open_episodes(tmp_path)
+
+
+# RLDS, written with TensorBoard's record writer and Google's protocol buffers
+
+
+def example_class():
+    """`tf.train.Example` from its published definition."""
+    file = descriptor_pb2.FileDescriptorProto(name="example.proto", package="t", syntax="proto3")
+    field = descriptor_pb2.FieldDescriptorProto
+
+    def message(name, *fields, within=file.message_type):
+        made = within.add(name=name)
+        for number, (title, kind, several) in enumerate(fields, 1):
+            named = {"type_name": kind, "type": field.TYPE_MESSAGE} if isinstance(kind, str) else {}
+            label = field.LABEL_REPEATED if several else field.LABEL_OPTIONAL
+            made.field.add(name=title, number=number, label=label, **(named or {"type": kind}))
+        return made
+
+    message("BytesList", ("value", field.TYPE_BYTES, True))
+    message("FloatList", ("value", field.TYPE_FLOAT, True))
+    message("Int64List", ("value", field.TYPE_INT64, True))
+    message("Feature", ("bytes_list", ".t.BytesList", False), ("float_list", ".t.FloatList", False),
+            ("int64_list", ".t.Int64List", False))  # fmt: skip
+    features = message("Features", ("feature", ".t.Features.FeatureEntry", True))
+    entry = message("FeatureEntry", ("key", field.TYPE_STRING, False),
+                    ("value", ".t.Feature", False), within=features.nested_type)  # fmt: skip
+    entry.options.map_entry = True
+    message("Example", ("features", ".t.Features", False))
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Example"))
+
+
+def save_rlds(path, trajectories, form="png", cameras=("image",), scale=1.0, **more):
+    """As TFDS writes them: the last step's action and reward are there and mean nothing."""
+    example_type = example_class()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:
+        writer = RecordWriter(file)
+        for t in trajectories:
+            example, steps = example_type(), len(t) + 1
+            feature = example.features.feature
+            for camera in cameras:
+                images = [encoded(image, form) for image in t.image]
+                feature[f"steps/observation/{camera}"].bytes_list.value.extend(images)
+            action = np.concatenate([scale * t.action, np.full((1, 2), 9)])
+            feature["steps/action"].float_list.value.extend(action.ravel().tolist())
+            feature["steps/reward"].float_list.value.extend([*t.reward.tolist(), 77.0])
+            ends = [0] * len(t) + [1]
+            feature["steps/is_first"].int64_list.value.extend(ends[::-1])
+            feature["steps/is_last"].int64_list.value.extend(ends)
+            terminal = [0] * (steps - 1) + [int(t.terminated)]
+            feature["steps/is_terminal"].int64_list.value.extend(terminal)
+            feature["episode_metadata/file_path"].bytes_list.value.append(b"somewhere")
+            writer.write(example.SerializeToString())
+        writer.flush()
+
+
+def encoded(image, form):
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, form)
+    return out.getvalue()
+
+
+def test_rlds_episodes_keep_to_the_chain_and_the_last_action_means_nothing(tmp_path):
+    old = [chain(5, 0, terminated=True), chain(300, 1), chain(1, 2)]
+    save_rlds(tmp_path / "1.0.0/chain-train.tfrecord-00000-of-00002", old[:2])
+    save_rlds(tmp_path / "1.0.0/chain-train.tfrecord-00001-of-00002", old[2:])
+    save_rlds(tmp_path / "1.0.0/chain-test.tfrecord-00000-of-00001", old[:1])
+    new = list(open_episodes(tmp_path, split="train", embodiment="arm", **SMALL))
+    assert len(new) == 3
+    for found, expected in zip(new, old, strict=True):
+        check_same(found, expected)
+    assert new[2].embodiment == "arm"
+    assert new[2].source == "1.0.0/chain-train.tfrecord-00001-of-00002 at byte 12"
+    assert len(TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", **SMALL)) == 4
+
+
+def test_rlds_actions_are_rescaled_from_the_limits_given(tmp_path):
+    save_rlds(tmp_path / "a.tfrecord", [chain(5)], scale=3.0)
+    check_same(open_episodes(tmp_path, **LIMITS, **SMALL)[0], chain(5))
+    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12.*rescale"):
+        open_episodes(tmp_path, **SMALL)[0]
+
+
+def test_an_rlds_image_is_chosen_if_there_are_several(tmp_path):
+    save_rlds(tmp_path / "a.tfrecord", [chain(5)], cameras=("front", "wrist"))
+    with pytest.raises(ValueError, match="2 images a step; give image_key, one of: observation/fr"):
+        open_episodes(tmp_path, "rlds", **SMALL)[0]
+    check_same(open_episodes(tmp_path, image_key="wrist", **SMALL)[0], chain(5))
+    with pytest.raises(ValueError, match="no 'world_vector' in its steps; there are: "):
+        open_episodes(tmp_path, image_key="wrist", action_key="world_vector", **SMALL)[0]
+
+
+def test_rlds_images_that_are_jpeg_are_warned_of_once(tmp_path):
+    save_rlds(tmp_path / "a.tfrecord", [chain(5), chain(6)], "jpeg")
+    with pytest.warns(UserWarning, match="are JPEG, which is lossy") as warned:
+        TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", image_size=8)
+    assert len(warned) == 1
+
+
+@pytest.mark.parametrize("share", [0.3, 0.97])
+def test_a_tfrecord_that_is_cut_short_is_named(tmp_path, share):
+    save_rlds(tmp_path / "a.tfrecord", [chain(50), chain(50)])
+    content = (tmp_path / "a.tfrecord").read_bytes()
+    (tmp_path / "a.tfrecord").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=r"a\.tfrecord is cut short: a record at byte"):
+        open_episodes(tmp_path, "rlds", **SMALL)
+
+
+def test_a_damaged_image_or_record_of_rlds_is_named(tmp_path):
+    save_rlds(tmp_path / "a.tfrecord", [chain(50)])
+    content = bytearray((tmp_path / "a.tfrecord").read_bytes())
+    at = content.index(b"IDAT")
+    content[at + 6 : at + 20] = bytes(14)
+    (tmp_path / "a.tfrecord").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12 has a damaged image"):
+        open_episodes(tmp_path, **SMALL)[0]
+    content[12] = 0x0F  # a field of a kind that does not exist
+    (tmp_path / "a.tfrecord").write_bytes(content)
+    with pytest.raises(ValueError, match=r"byte 12 is damaged or no tf\.train\.Example"):
+        open_episodes(tmp_path, **SMALL)[0]
+
+
+# The command
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
+    try:
+        command_line.main()
+    except SystemExit as stopped:
+        return stopped.code
+    return 0
+
+
+def test_the_command_converts_with_labels_and_prints_what_came_of_it(tmp_path, monkeypatch, capsys):
+    save_npz(tmp_path / "in/0.npz", chain(5, size=64))
+    labels = ["--embodiment", "walker", "--task", "run", "--rewards"]
+    assert call(monkeypatch, "import", "npz", tmp_path / "in", tmp_path / "out", *labels) == 0
+    assert "trajectories     1" in capsys.readouterr().out
+    [new] = TrajectoryDataset.open(tmp_path / "out")
+    check_same(new, chain(5, size=64))
+    assert (new.embodiment, new.task) == ("walker", "run")
+
+
+def test_the_command_warns_of_lossy_images_and_takes_limits(tmp_path, monkeypatch, capsys):
+    save_rlds(tmp_path / "in/a.tfrecord", [chain(5, size=16)], "jpeg", scale=3.0)
+    words = ["auto", tmp_path / "in", tmp_path / "out", "--low=-3,-3", "--high", "3,3"]
+    assert call(monkeypatch, "import", *words) == 0
+    assert "Warning: The images of" in capsys.readouterr().err
+    np.testing.assert_allclose(TrajectoryDataset.open(tmp_path / "out")[0].action, chain(5).action)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["lerobt"], "Did you mean 'lerobot'"),
+        (["npz", "--camera", "front"], "No option for npz 'camera'"),
+        (["hdf5", "--low=a,b"], "--low wants numbers with commas between, got 'a,b'"),
+        (["npz"], "holds no .npz file"),
+    ],
+)
+def test_what_the_command_cannot_import_ends_in_one_line(
+    tmp_path, monkeypatch, capsys, words, message
+):
+    form, *options = words
+    assert call(monkeypatch, "import", form, tmp_path / "in", tmp_path / "out", *options) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

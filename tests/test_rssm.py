@@ -76,10 +76,12 @@ def slow_posterior(rssm, h, e):
 def test_the_gru_is_the_slow_reference(rssm):
     state, action = some_state(), noise(B, A)
     with torch.no_grad():
-        fast = rssm.step(state, action)
+        plain = rssm.step(state, action)
+        shared = rssm.step(state, action, rssm.gru.shared_weight())
         for b in range(B):
             slow = slow_gru(rssm.gru, state.deter[b], state.stoch[b], action[b])
-            torch.testing.assert_close(fast[b], slow)
+            torch.testing.assert_close(plain[b], slow)
+            torch.testing.assert_close(shared[b], slow)
 
 
 def test_a_units_gates_stand_in_its_own_block(rssm):
@@ -171,6 +173,23 @@ def test_a_sequence_may_be_filtered_in_pieces(rssm):
     tail, *_ = rssm.observe(embed[:, 2:], action[:, 2:], is_first[:, 2:], last, sample=False)
     torch.testing.assert_close(whole.deter, torch.cat([head.deter, tail.deter], 1))
     torch.testing.assert_close(whole.stoch, torch.cat([head.stoch, tail.stoch], 1))
+
+
+@pytest.mark.parametrize("sample", [True, False])
+def test_a_filter_step_is_a_sequence_of_one_image(rssm, sample):
+    embed, action, is_first = noise(B, 1, E), noise(B, 1, A, seed=1), first((1, 0))[:, :1]
+    with torch.no_grad():
+        whole, *_ = rssm.observe(
+            embed, action, is_first, some_state(), torch.Generator().manual_seed(5), sample
+        )
+        step = rssm.filter_step(
+            some_state(),
+            *(x[:, 0] for x in (action, embed, is_first)),
+            torch.Generator().manual_seed(5),
+            sample,
+        )
+    torch.testing.assert_close(whole.deter[:, 0], step.deter)
+    assert torch.equal(whole.stoch[:, 0], step.stoch)
 
 
 def test_the_same_generator_gives_the_same_latents(rssm):

@@ -90,7 +90,7 @@ def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):
 def test_every_method_runs(tmp_path, method):
     result = run(job(tmp_path, method))
     assert np.isfinite(result["scores"]["WPT"]["mean"])
-    guided = method not in ("scratch", "no-guidance")
+    guided = method not in ("scratch", "pretrain-only", "no-guidance")
     assert ("prior actor" in result["scores"]) == guided
     assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
 

@@ -1,12 +1,21 @@
 import json
+import sys
+import zlib
+from collections import Counter
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from debug_agent import SETTINGS, agent
+from stable_baselines3 import SAC
 
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.exploration import EXPLORE, Plan2Explore
+from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import collect as module
-from wpt_agents.zoo.collect import COLOURS, collect, coloured_noise, noise_actions, record
+from wpt_agents.zoo.behaviours import COLOURS, coloured_noise, noise_actions
+from wpt_agents.zoo.collect import collect, record
+from wpt_agents.zoo.policies import SavedPolicy, sees_states
 
 gym.register("PlainDot-v0", entry_point="toy_env:DotEnv")
 gym.register("WideDot-v0", entry_point="toy_env:DotEnv", kwargs={"actions": 3})
@@ -141,7 +150,11 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"tasks": []}, "different tasks"),
         ({"tasks": [DOT, DOT]}, "different tasks"),
         ({"episodes": 0}, "at least 1 episode"),
-        ({"behaviour": "expert"}, "There are: noise, scripted"),
+        ({"behaviour": "noize"}, "Did you mean 'noise'"),
+        ({"behaviour": "policy"}, "wants policy=FILE"),
+        ({"policy": "a.zip"}, "and no other"),
+        ({"behaviour": "policy", "policy": "no.zip"}, r"No policy no\.zip"),
+        ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),
     ],
 )
@@ -158,3 +171,146 @@ def test_scripts_are_noised_from_episode_to_episode(tmp_path):
     assert [len(t) for t in data] == [100, 100]
     roughness = [np.abs(np.diff(t.action[:, 3])).mean() for t in data]  # the gripper's
     assert roughness[0] < roughness[1]
+
+
+# Saved policies
+
+
+def test_a_saved_policy_is_noised_from_episode_to_episode(tmp_path):
+    model = agent(gym.make(DOT), embodiment="dot")
+    model.save(tmp_path / "dot.zip")
+    given = {"behaviour": "policy", "policy": str(tmp_path / "dot.zip"), "sigmas": [0.0, 0.5]}
+    data = collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False, **given)
+    names = [f"policy dot.zip, sigma {sigma}" for sigma in (0.0, 0.5, 0.0)]
+    assert [t.source for t in data] == names
+    env, state = gym.make(DOT), None
+    seed = int(np.random.SeedSequence([0, zlib.crc32(DOT.encode()), 0]).generate_state(1)[0])
+    obs, _ = env.reset(seed=seed)
+    for step in range(3):  # without noise it is what `predict` says
+        action, state = model.predict(obs, state, np.array([step == 0]), deterministic=True)
+        np.testing.assert_allclose(data[0].action[step], action, atol=1e-6)
+        obs = env.step(action)[0]
+    roughness = [np.abs(np.diff(t.action, axis=0)).mean() for t in data]
+    assert roughness[1] > roughness[0]
+
+
+def test_a_policy_of_sb3_that_takes_states_is_shown_states_and_rescaled(tmp_path):
+    space = gym.spaces.Box(-3.0, 3.0, (2,))  # twice and more of the task's [-1, 1]
+    model = SAC("MlpPolicy", StateEnv(space), learning_starts=0, buffer_size=10, device="cpu")
+    model.save(tmp_path / "sac.zip")
+    name = f"sac:{tmp_path / 'sac.zip'}"
+    assert sees_states(name)
+    act = SavedPolicy(np.random.default_rng(0), name, 0.0, 2)
+    expected = model.predict(np.ones(5, np.float32), deterministic=True)[0] / 3
+    np.testing.assert_allclose(act(None, {"state": np.ones(5)}, 0), expected, atol=1e-6)
+    with pytest.raises(ValueError, match="the task takes 6 actions; give a policy of this robot"):
+        SavedPolicy(np.random.default_rng(0), name, 0.0, 6)
+
+
+class StateEnv(gym.Env):
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+
+
+def test_rewards_are_stored_if_asked_for(tmp_path):
+    (stored,) = collect(tmp_path, [DOT], 1, workers=1, progress_bar=False, rewards=True)
+    env = gym.make(DOT).unwrapped
+    env.reset(seed=0)
+    assert stored.reward is not None and stored.reward.shape == (25,)
+
+
+def test_uniform_actions_are_a_behaviour(tmp_path):
+    data = collect(tmp_path, [DOT], 8, workers=1, progress_bar=False, behaviour="random")
+    actions = np.concatenate([t.action for t in data])
+    assert np.abs(actions).max() <= 1
+    assert actions.std() == pytest.approx(3**-0.5, abs=0.03)
+    assert {t.source for t in data} == {"uniform random actions"}
+
+
+# Curiosity
+
+QUICK = {k: v for k, v in SETTINGS.items() if k in EXPLORE} | {"imagine_horizon": 3}
+QUICK |= {"offline_ratio": 0.0, "guidance": 0.0}
+
+
+def curious(path, tasks=(DOT, WIDE), workers=1, behaviour="plan2explore", episodes=3):
+    return collect(path, tasks, episodes, 1, workers, behaviour, progress_bar=False, settings=QUICK)
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    return curious(tmp_path_factory.mktemp("explored") / "data")
+
+
+def test_curious_agents_play_task_by_task_without_rewards(explored):
+    assert explored.tasks == [DOT] * 3 + [WIDE] * 3
+    assert explored.action_dims.tolist() == [2] * 3 + [3] * 3
+    assert [t.reward for t in explored] == [None] * 6
+    assert explored[4].source == "plan2explore, episode 2"
+    assert not list(explored.path.glob("exploring-*"))
+
+
+def test_curious_agents_play_the_same_in_processes_of_their_own(explored, tmp_path):
+    assert same(explored, curious(tmp_path / "two", workers=2))
+
+
+@pytest.mark.parametrize("stop_at", [2, 4])
+def test_a_curious_agent_that_was_stopped_goes_on_to_the_same_data(
+    explored, tmp_path, monkeypatch, stop_at
+):
+    saved, save = [], Plan2Explore.save
+
+    def dying(model, path):
+        saved.append(path)
+        if len(saved) == stop_at:  # the episode is stored, the model is not
+            raise KeyboardInterrupt
+        save(model, path)
+
+    monkeypatch.setattr(Plan2Explore, "save", dying)
+    with pytest.raises(KeyboardInterrupt):
+        curious(tmp_path)
+    assert len(TrajectoryDataset.open(tmp_path)) == 3 * ((stop_at - 1) // 3)
+    monkeypatch.setattr(Plan2Explore, "save", save)
+    assert same(explored, curious(tmp_path))
+
+
+# The paper's split
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
+    command_line.main()
+
+
+def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        module, "collect", lambda *given, **more: asked.append((given, more)) or stop()
+    )
+    with pytest.raises(StopIteration):
+        call(monkeypatch, "collect", "--suite", "metaworld", "--out", tmp_path)
+    [((_, tasks, episodes, seed, _, behaviour, _), more)] = asked
+    assert (len(tasks), episodes, seed, behaviour) == (50, 1000, 0, "scripted")
+    plan = module.Plan(sigmas=tuple(more["sigmas"]))
+    count = Counter(plan.sigma(episode) for episode in range(episodes))
+    assert count == {0.1: 200, 0.3: 200, 0.5: 200, 1.0: 200, 2.0: 200}
+    assert not more["rewards"]
+
+
+def stop():
+    raise StopIteration
+
+
+def test_the_command_collects_with_what_it_is_given(tmp_path, monkeypatch):
+    words = ["--tasks", "walker-stand", "--behaviour", "icm", "--episodes", 7]
+    asked = []
+    monkeypatch.setattr(
+        module, "collect", lambda *given, **more: asked.append((given, more)) or stop()
+    )
+    with pytest.raises(StopIteration):
+        call(monkeypatch, "collect", "--out", tmp_path, *words, "--set", "size=debug", "gamma=0.9")
+    [((_, tasks, episodes, _, _, behaviour, _), more)] = asked
+    assert (tasks, episodes, behaviour) == (["wpt/dmc-walker-stand-v0"], 7, "icm")
+    assert more["settings"] == {"size": "debug", "gamma": 0.9}

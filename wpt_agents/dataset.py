@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from wpt_agents.codecs import find_codec
+from wpt_agents.importers.convert import Conversions
 from wpt_agents.index import (
     Entry,
     Meta,
@@ -51,7 +52,7 @@ class _Part(Trajectory):
         pass
 
 
-class TrajectoryDataset:
+class TrajectoryDataset(Conversions):
     """Trajectories in a folder (see `wpt_agents.shards`); one writer, any number of readers.
 
     A reader sees the trajectories that were there when it opened the folder. Nothing but the index

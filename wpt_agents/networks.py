@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 NORM_EPS = 1e-3
-PIECE = 2**22  # numbers in the largest tensor that a stack of image layers makes on a CPU, 16 MB
+PIECE = 2**22  # numbers in the largest tensor that a stack of layers makes on a CPU: 16 MB
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,25 @@ class LinearNorm(nn.Sequential):
         super().__init__(nn.Linear(inputs, outputs), nn.LayerNorm(outputs, eps=NORM_EPS), nn.SiLU())
 
 
+class DownConv(nn.Conv2d):
+    """A convolution of stride 2; of a single image, as when acting, a matrix product of patches.
+
+    That spares the reordering of the weights, which one image does not repay.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
+        super().__init__(inputs, outputs, kernel, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) -> (N, outputs, (H - K) // 2 + 1, (W - K) // 2 + 1)."""
+        if len(x) != 1 or torch.is_grad_enabled() or x.device.type != "cpu":
+            return super().forward(x)
+        kernel = self.kernel_size[0]
+        patches = x[0].unfold(1, kernel, 2).unfold(2, kernel, 2).permute(1, 2, 0, 3, 4)
+        out = F.linear(patches.flatten(2), self.weight.flatten(1), self.bias)
+        return out.permute(2, 0, 1)[None]
+
+
 class Encoder(nn.Module):
     """e(o): four strided convolutions, 64 > 31 > 14 > 6 > 2, flattened.
 
@@ -104,7 +123,7 @@ class Encoder(nn.Module):
         channels = (channels_in, depth, 2 * depth, 4 * depth, 8 * depth)
         layers: list[nn.Module] = []
         for inputs, outputs in itertools.pairwise(channels):
-            layers += [nn.Conv2d(inputs, outputs, 4, 2), ChannelNorm(outputs), nn.SiLU()]
+            layers += [DownConv(inputs, outputs, 4), ChannelNorm(outputs), nn.SiLU()]
         self.layers = nn.Sequential(*layers)
         self.embed_dim = 8 * depth * 2 * 2
 
@@ -131,10 +150,11 @@ class UpConv(nn.ConvTranspose2d):
         inputs, outputs, kernel, _ = self.weight.shape
         weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
         phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
-        out = F.conv2d(x, phases.reshape(4 * outputs, inputs, 3, 3), padding=2)
+        phases = phases.reshape(4 * outputs, inputs, 3, 3)
+        out = F.conv2d(x, phases, self.bias.repeat(4), padding=2)
         out = out.permute(0, 2, 3, 1).unflatten(-1, (2, 2, outputs)).transpose(2, 3)
-        size = 2 * x.shape[-1] + kernel - 2
-        out = out.flatten(3, 4).flatten(1, 2)[:, :size, :size] + self.bias
+        out = out.flatten(3, 4).flatten(1, 2)
+        out = out if kernel == 6 else out[:, :-1, :-1]
         return out.permute(0, 3, 1, 2)
 
 
@@ -200,7 +220,7 @@ class Head(nn.Module):
         self.from_stoch = nn.Linear(size.stoch * size.classes, size.units)
         hidden = [LinearNorm(size.units, size.units) for _ in range(layers)]
         self.layers = nn.Sequential(*hidden, nn.Linear(size.units, outputs))
-        self.deter_dim = size.deter
+        self.deter_dim, self.units = size.deter, size.units
         if zero_init:
             nn.init.zeros_(self.layers[-1].weight)
             nn.init.zeros_(self.layers[-1].bias)
@@ -208,16 +228,18 @@ class Head(nn.Module):
     def forward(self, feat: Tensor) -> Tensor:
         """(..., D + S*K) -> (..., outputs)."""
         flat = feat.reshape(-1, feat.shape[-1])
-        deter, stoch = flat[:, : self.deter_dim], flat[:, self.deter_dim :]
-        out = self.layers(self.from_deter(deter) + self.from_stoch(stoch))
-        return out.unflatten(0, feat.shape[:-1])
+        return in_pieces(self._rows, flat, 2 * self.units).unflatten(0, feat.shape[:-1])
+
+    def _rows(self, feat: Tensor) -> Tensor:
+        deter, stoch = feat[:, : self.deter_dim], feat[:, self.deter_dim :]
+        return self.layers(self.from_deter(deter) + self.from_stoch(stoch))
 
 
-def in_pieces(layers: nn.Module, x: Tensor, largest: int) -> Tensor:
+def in_pieces(layers: Callable[[Tensor], Tensor], x: Tensor, largest: int) -> Tensor:
     """`layers(x)`, on a CPU for a few rows at a time.
 
     Memory beyond 32 MB is not kept by glibc's malloc but given back, and fetched from the system
-    page by page at the next call, which takes as long as the convolutions.
+    page by page at the next call, which takes about as long as the arithmetic.
 
     :param largest: the numbers that a row has where it has most
     """

@@ -107,7 +107,7 @@ class WPTPolicy(BasePolicy):
         shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
         return tuple(np.zeros(s, np.float32) for s in (*shapes, (n, self.max_action_dim)))
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def act(
         self,
         image: np.ndarray,
@@ -134,21 +134,20 @@ class WPTPolicy(BasePolicy):
         deter, stoch, action = (self._tensor(x) for x in state or self.initial_state(n))
         first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
         embed = self.world_model.encoder(self._tensor(image))
-        post, _, _ = self.world_model.rssm.observe(
-            embed[:, None],
-            action[:, None],
-            self._tensor(first)[:, None],
+        post = self.world_model.rssm.filter_step(
             Latent(deter, stoch),
+            action,
+            embed,
+            self._tensor(first),
             generator,
             sample=not deterministic,
         )
-        dist = self.actor.dist(post.feat[:, 0], self.action_mask)
+        dist = self.actor.dist(post.feat, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
         if not torch.isfinite(action).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
-        return action.cpu().numpy(), tuple(
-            x.cpu().numpy() for x in (post.deter[:, 0], post.stoch[:, 0], action)
-        )
+        state = tuple(x.cpu().numpy() for x in (*post, action))
+        return state[-1], state
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array)).to(self.device)

@@ -45,20 +45,37 @@ class BlockGRU(nn.Module):
         self.norm = nn.LayerNorm(deter, eps=NORM_EPS)
         self.gates = BlockLinear(deter, 3 * deter, self.blocks)
 
-    def forward(self, deter: Tensor, stoch: Tensor, action_embed: Tensor) -> Tensor:
-        """One step: (N, D), (N, S, K), (N, hidden) -> (N, D)."""
+    def shared_weight(self) -> Tensor:
+        """What every block makes of its view of h, z and a, as one matrix: (3 hidden, D)."""
+        own = self.hidden.weight.shape[-1]
+        return self.hidden.weight[:, own:].transpose(0, 1).flatten(1)
+
+    def forward(
+        self, deter: Tensor, stoch: Tensor, action_embed: Tensor, shared: Tensor | None = None
+    ) -> Tensor:
+        """One step: (N, D), (N, S, K), (N, hidden) -> (N, D).
+
+        :param shared: `shared_weight`, worth making where it serves many states or steps
+        """
         inputs = torch.cat(
             [self.from_deter(deter), self.from_stoch(stoch.flatten(1)), action_embed], -1
         )
-        shared = inputs.unsqueeze(1).expand(-1, self.blocks, -1)
         own = deter.unflatten(-1, (self.blocks, -1))
-        hidden = F.silu(self.norm(self.hidden(torch.cat([own, shared], -1).flatten(1))))
+        if shared is None:
+            views = torch.cat([own, inputs.unsqueeze(1).expand(-1, self.blocks, -1)], -1)
+            hidden = self.hidden(views.flatten(1))
+        else:  # the same sums without a copy of the inputs for each block
+            width = own.shape[-1]
+            blocks = torch.bmm(own.transpose(0, 1), self.hidden.weight[:, :width])
+            hidden = torch.addmm(self.hidden.bias, inputs, shared)
+            hidden = hidden + blocks.transpose(0, 1).flatten(1)
+        hidden = F.silu(self.norm(hidden))
         # the three gates of a unit stand in the unit's own block
         gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1))
-        reset, candidate, update = (g.flatten(1) for g in gates.unbind(2))
+        reset, candidate, update = gates.unbind(2)
         update = torch.sigmoid(update - 1)  # starts out remembering
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        return update * candidate + (1 - update) * deter
+        return (update * candidate + (1 - update) * own).flatten(1)
 
 
 class RSSM(nn.Module):
@@ -91,9 +108,9 @@ class RSSM(nn.Module):
         zeros = like.new_zeros
         return Latent(zeros(n, size.deter), zeros(n, size.stoch, size.classes))
 
-    def step(self, state: Latent, action: Tensor) -> Tensor:
+    def step(self, state: Latent, action: Tensor, shared: Tensor | None = None) -> Tensor:
         """h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): (N, D)."""
-        return self.gru(state.deter, state.stoch, self.gru.from_action(action))
+        return self.gru(state.deter, state.stoch, self.gru.from_action(action), shared)
 
     def prior(self, deter: Tensor) -> Tensor:
         """p(z | h): (..., D) -> (..., S, K) log-probabilities."""
@@ -182,9 +199,8 @@ class RSSM(nn.Module):
     ) -> tuple[Latent, Tensor]:
         """What `_filter` returns, in far fewer operators."""
         gru, hidden = self.gru, self.size.hidden
-        own, shared = gru.hidden.weight.split([self.size.deter // gru.blocks, 3 * hidden], 1)
-        shared = shared.transpose(0, 1).flatten(1)  # each block's view of all of z and a, at once
-        state_part, action_part = shared.split([2 * hidden, hidden])
+        state_part, action_part = gru.shared_weight().split([2 * hidden, hidden])
+        own = gru.hidden.weight[:, : self.size.deter // gru.blocks]
         action_half = action_embed.transpose(0, 1) @ action_part + gru.hidden.bias
         deters, stochs, logits = FilterScan.apply(
             self.unimix,
@@ -199,6 +215,29 @@ class RSSM(nn.Module):
         )
         post = Latent(deters.transpose(0, 1), stochs.transpose(0, 1))
         return post, logits.transpose(0, 1)
+
+    def filter_step(
+        self,
+        state: Latent,
+        action: Tensor,
+        embed: Tensor,
+        is_first: Tensor,
+        generator: Generator | None = None,
+        sample: bool = True,
+    ) -> Latent:
+        """One step of `observe` without the prior, which acting has no use for.
+
+        :param state: (N, ...)
+        :param action: (N, A), what led to the image
+        :param embed: (N, E)
+        :param is_first: (N,) bool
+        """
+        keep = (~is_first).to(embed.dtype)[:, None]
+        state = Latent(state.deter * keep, state.stoch * keep[..., None])
+        deter = self.step(state, action * keep)
+        logits = self.posterior(deter, embed)
+        draw = sample_one_hot(logits, generator) if sample else mode_one_hot(logits)
+        return Latent(deter, draw)
 
     def imagine(
         self,
@@ -216,9 +255,10 @@ class RSSM(nn.Module):
             actions taken at the steps 0 .. H - 1, (N, H, A)
         """
         states, actions = [state], []
+        shared = self.gru.shared_weight()
         for t in range(horizon):
             action = policy(state, t)
-            deter = self.step(state, action)
+            deter = self.step(state, action, shared)
             log_probs = self.prior(deter)
             stoch = sample_one_hot(log_probs, generator) if sample else mode_one_hot(log_probs)
             state = Latent(deter, stoch)

@@ -127,21 +127,23 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
     length, used = len(trajectory), trajectory.action_dim
     assert 0 <= start < stop <= length + 1, (start, stop, length)
     assert used <= width, (used, width)
-    steps = np.arange(start, stop)
-    action = np.zeros((len(steps), width), np.float32)
-    reward = np.zeros(len(steps), np.float32)
-    later = steps > start  # the first image of a window starts a new state: nothing led to it
-    action[later, :used] = trajectory.action[steps[later] - 1, :used]
+    images = stop - start
+    action, reward = np.zeros((images, width), np.float32), np.zeros(images, np.float32)
+    is_first, is_terminal, known = np.zeros((3, images), bool)
+    is_first[0] = True  # a window's first image starts a new state: no action led to it
+    action[1:, :used] = trajectory.action[start : stop - 1, :used]
     if trajectory.reward is not None:
-        before = steps > 0
-        reward[before] = trajectory.reward[steps[before] - 1]
+        begin = max(start, 1)  # no reward led to image 0
+        reward[begin - start :] = trajectory.reward[begin - 1 : stop - 1]
+        known[begin - start :] = True
+    is_terminal[-1] = trajectory.terminated and stop == length + 1
     return {
         "image": trajectory.image[start:stop],
         "action": action,
         "reward": reward,
-        "is_first": ~later,
-        "is_terminal": (steps == length) & trajectory.terminated,
-        "reward_known": (steps > 0) & (trajectory.reward is not None),  # none led to image 0
+        "is_first": is_first,
+        "is_terminal": is_terminal,
+        "reward_known": known,
     }
 
 

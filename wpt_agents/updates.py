@@ -19,7 +19,7 @@ from wpt_agents.actor_critic import (
     return_range,
 )
 from wpt_agents.networks import SIZES, frozen
-from wpt_agents.policy import WPTPolicy
+from wpt_agents.policy import Dream, WPTPolicy
 from wpt_agents.replay import ReplayBuffer, mix
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Batch
@@ -124,12 +124,11 @@ class Updates:
         self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
     ) -> None:
         """Actor and critic on imagined trajectories, Eq. (2) to (4)."""
-        policy, model = self.policy, self.policy.world_model
+        policy = self.policy
         with self._autocast():
             dream = policy.dream(start, self.imagine_horizon, generator)
             feat = dream.states.feat
-            with frozen(model):
-                reward = model.reward(feat[:, :-1])
+            reward = self._imagined_reward(dream)
             value = policy.target_critic.value(feat)
             returns = lambda_return(reward, value, self.gamma, self.lam)
             spread = scale = torch.ones_like(policy.return_scale)
@@ -156,6 +155,12 @@ class Updates:
             "critic_grad_norm": critic_norm,
         }.items():
             metrics[f"train/{key}"].append(tensor.detach())
+
+    def _imagined_reward(self, dream: Dream) -> Tensor:
+        """(N, H): what arriving in the imagined states 0 .. H-1 pays."""
+        model = self.policy.world_model
+        with frozen(model):
+            return model.reward(dream.states.feat[:, :-1])
 
     def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
         """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.

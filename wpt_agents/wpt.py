@@ -10,14 +10,11 @@ Example::
 
 import inspect
 import os
-import shutil
 import sys
-import tempfile
 import time
 import warnings
-import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +36,7 @@ from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
+from wpt_agents.importers.convert import Data
 from wpt_agents.model_file import read_model
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
@@ -50,7 +48,6 @@ from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, PRETRAIN, WARMUP, WINDOW, Updates, torch_seed
 
-Data = str | os.PathLike[str] | TrajectoryDataset | Iterable[Trajectory]
 EVERY = 1000  # pre-training steps between checkpoints
 
 
@@ -69,8 +66,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
     :param policy: "WPTPolicy"
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
     :param size: the widths of all networks: debug, tiny, small, medium or paper
-    :param dataset: D_off, for rehearsal and guidance: a store's path, a TrajectoryDataset or
-        trajectories
+    :param dataset: D_off, for rehearsal and guidance: whatever `TrajectoryDataset.of` takes
     :param max_action_dim: A, the width that all actions are padded to
     :param embodiment: the robot's name; retrieval keeps to data that bears it
     :param batch_size: sequences in a batch
@@ -222,17 +218,10 @@ class WPT(Updates, Saving, BaseAlgorithm):
     # ------------------------------------------------------------------ the data and the task
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Takes D_off: a store's path, a TrajectoryDataset, or trajectories (stored aside)."""
+        """Takes D_off: whatever `TrajectoryDataset.of` takes, other people's files too."""
         if dataset is None:
             return
-        if isinstance(dataset, str | os.PathLike):
-            dataset = TrajectoryDataset.open(dataset)
-        elif not isinstance(dataset, TrajectoryDataset):
-            store = TrajectoryDataset.create(tempfile.mkdtemp(prefix="wpt_dataset_"))
-            weakref.finalize(store, shutil.rmtree, store.path, ignore_errors=True)
-            with store:
-                store.extend(dataset)
-            dataset = store
+        dataset = TrajectoryDataset.of(dataset)
         check_dataset(dataset, self.max_action_dim, self.batch_length)
         self.dataset = dataset
 
@@ -292,7 +281,8 @@ class WPT(Updates, Saving, BaseAlgorithm):
     ) -> "WPT":
         """Trains a world model on reward-free trajectories of any embodiments, by Eq. (1).
 
-        :param dataset: a store's path, a TrajectoryDataset, or trajectories
+        :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
+            whatever `TrajectoryDataset.of` takes
         :param env: the environment to go on with, if known
         :param steps: updates
         :param run_dir: `model.zip` is written there every 1000 steps and at the end; if it is

@@ -25,7 +25,7 @@ def pixels(
         and `data`, several times quicker; `None` shrinks what `env.render()` answers
     :param camera: the camera to draw from; only together with `rendering`
 
-    >>> env = wpt_envs.pixels(gym.make("CartPole-v1", render_mode="rgb_array"))
+    >>> env = wpt_envs.pixels(gym.make("Ant-v5", render_mode="rgb_array"))
     """
     return dress(
         _LookRendered(env) if rendering is None else _LookDrawn(env, rendering, camera),

@@ -2,8 +2,7 @@
 
 Example::
 
-    episodes = open_episodes("exorl/walker", embodiment="walker")
-    dataset = convert(episodes, "walker-store", progress_bar=True)
+    dataset = TrajectoryDataset.from_npz("exorl/walker", "walker-store", embodiment="walker")
 
 Formats differ in when an action stands (`wpt_agents.trajectory` has ours); each reader says which
 convention it converts from.

@@ -7,6 +7,7 @@ so that action is left out, and no terminal state is seen.
 import io
 import json
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,12 @@ class LeRobotEpisodes(Episodes):
         self._low, self._high = self._limits(low, high)
         self._rows = self._episodes()
         self._open: tuple[Path, Any] | None = None
+        if self._info["features"][self._camera]["dtype"] == "video":
+            warnings.warn(
+                f"LeRobot stored the images of {folder} as video, which is lossy; record with "
+                "dtype 'image' to keep them as they were",
+                stacklevel=2,
+            )
 
     def _choose(self, camera: str | None) -> str:
         features = self._info["features"]

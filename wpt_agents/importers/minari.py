@@ -11,6 +11,12 @@ from wpt_agents.importers.episodes import Episodes, needs, rescaled
 from wpt_agents.trajectory import Trajectory
 
 
+def local_minari(name: str) -> Path:
+    """Where Minari keeps the local dataset of this name."""
+    root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
+    return Path(root) / name
+
+
 class MinariEpisodes(Episodes):
     """A Minari dataset's episodes; actions are rescaled from its action space to [-1, 1].
 

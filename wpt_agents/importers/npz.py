@@ -16,6 +16,7 @@ from wpt_agents.importers.episodes import Episodes
 from wpt_agents.trajectory import Trajectory
 
 IMAGE_KEYS = ("observation", "image", "pixels")
+OTHERS = ("action", "reward", "discount", "is_terminal", "is_first")
 
 
 class NpzEpisodes(Episodes):
@@ -39,7 +40,7 @@ class NpzEpisodes(Episodes):
 
     def __getitem__(self, i: int) -> Trajectory:
         file = self._files[i]
-        arrays = _arrays(file, {*self._keys, "action", "reward", "discount", "is_terminal"})
+        arrays = _arrays(file, {*self._keys, *OTHERS})
         key = next((key for key in self._keys if key in arrays), None)
         if key is None or "action" not in arrays:
             raise ValueError(
@@ -50,6 +51,11 @@ class NpzEpisodes(Episodes):
             raise ValueError(
                 f"{file} has {len(arrays['action'])} actions for {len(arrays[key])} images; in "
                 "this format they are equally many, the first action a placeholder"
+            )
+        if arrays.get("is_first", np.zeros(1))[1:].any():
+            raise ValueError(
+                f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
+                "write a file an episode"
             )
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         return self._trajectory(

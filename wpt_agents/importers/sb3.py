@@ -5,11 +5,14 @@ Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it re
 action is left out, and no terminal state is seen.
 """
 
+import os
+import pickle
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl
 
 from wpt_agents.importers.episodes import Episodes
 from wpt_agents.trajectory import Trajectory
@@ -18,14 +21,21 @@ from wpt_agents.trajectory import Trajectory
 class SB3Episodes(Episodes):
     """A replay buffer's episodes, environment by environment, oldest first.
 
-    SB3 saves buffers as pickles, which run code when loaded: load one yourself, with
-    `model.load_replay_buffer(path)`, if you trust it, and give `model.replay_buffer`.
-
+    :param buffer: in memory, or a file of `model.save_replay_buffer`
     :param image_key: where the images are, if observations are dictionaries
+    :param trust: load a file; SB3's are pickles, which run whatever code is in them
     """
 
-    def __init__(self, buffer: ReplayBuffer, image_key: str | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        buffer: ReplayBuffer | str | os.PathLike[str],
+        image_key: str | None = None,
+        trust: bool = False,
+        **options: Any,
+    ) -> None:
         super().__init__(**options)
+        if isinstance(buffer, str | os.PathLike):
+            buffer = _load(buffer, trust)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"Expected a ReplayBuffer of SB3, got {type(buffer).__name__}")
         self._buffer, self._key = buffer, image_key
@@ -72,3 +82,16 @@ class SB3Episodes(Episodes):
                 f"The replay buffer's observations are {', '.join(observations)}; give image_key"
             )
         return observations[self._key]
+
+
+def _load(path: str | os.PathLike[str], trust: bool) -> ReplayBuffer:
+    if not trust:
+        raise ValueError(
+            f"{path} is a pickle, as SB3 saves replay buffers, and loading it runs whatever code "
+            "is in it; if you trust it, say so with trust=True (--trust)"
+        )
+    try:
+        with open(path, "rb") as file:
+            return load_from_pkl(file)
+    except (OSError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path} cannot be read as a replay buffer of SB3: {error}") from error

@@ -1,14 +1,17 @@
-"""The commands: python -m wpt_agents.zoo {list, collect, pretrain, run, report}.
+"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report, bench}, and `data_commands`.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperCommand
+
+from wpt_agents.zoo import data_commands
+from wpt_agents.zoo.bench.command import bench
+from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
 
 app = typer.Typer(
     add_completion=False,
@@ -21,48 +24,17 @@ app = typer.Typer(
 )
 
 
-class Spaced(TyperCommand):
-    """Lets an option take several values at once: `--tasks a b` for `--tasks a --tasks b`."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Repeats the option's name before each further value."""
-        several = {o for p in self.params if p.multiple for o in p.opts}  # type: ignore[attr-defined]
-        spread: list[str] = []
-        option, given = None, False
-        for arg in args:
-            if arg.startswith("-"):
-                option, given = (arg if arg in several else None), False
-            elif option and given:
-                spread.append(option)
-            else:
-                given = True
-            spread.append(arg)
-        return super().parse_args(ctx, spread)
-
-
-Suite = Annotated[str, typer.Option(help="dmc, or another suite of `list`.")]
-Tasks = Annotated[
-    list[str],
-    typer.Option(help="Names or patterns, e.g. `walker-run 'cheetah-*'`. None: the paper's."),
-]
 PresetName = Annotated[
     str, typer.Option(help="How large: debug, demo, tiny, small, medium, paper (Table 2).")
 ]
-Settings = Annotated[
-    list[str],
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Changes the preset: a keyword of WPT (`gamma=0.98`), or `section.key=value` "
-        "(`pretrain.steps=500`, `env.rendering=near`).",
-    ),
-]
 Out = Annotated[Path, typer.Option(help="Where the run folders and the shared stages go.")]
-Workers = Annotated[int, typer.Option(min=1, help="Processes that collect data.")]
 Data = Annotated[
     Path | None, typer.Option(help="A dataset of your own. None: the preset's, collected.")
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
+
+
+data_commands.register(app)
 
 
 @app.command("list")
@@ -91,30 +63,6 @@ def list_tasks(
     for name in suite_names():
         console.print(f"presets of {name}: {', '.join(preset_names(name))}")
     console.print(f"methods: {', '.join(METHODS)}")
-
-
-@app.command("collect", cls=Spaced)
-def collect_data(
-    out: Annotated[Path, typer.Option(help="The dataset's folder; half of one is continued.")],
-    suite: Suite = "dmc",
-    tasks: Tasks = [],  # noqa: B006  # typer wants a list
-    episodes: Annotated[int, typer.Option(min=1, help="Of each task.")] = 30,
-    seed: int = 0,
-    workers: Workers = 2,
-    behaviour: Annotated[str, typer.Option(help="noise, or scripted (Meta-World).")] = "noise",
-    rendering: Annotated[str, typer.Option(help="exact, near or fast.")] = "near",
-) -> None:
-    """Plays tasks with noise and stores the episodes without rewards.
-
-    Example: `python -m wpt_agents.zoo collect --tasks walker-run cartpole-swingup --out data`
-    """
-    from wpt_agents.zoo.collect import collect
-    from wpt_agents.zoo.tasks import find_tasks
-
-    ids = [row.id for row in find_tasks(suite, tasks)]
-    dataset = collect(out, ids, episodes, seed, workers, behaviour, {"rendering": rendering})
-    for name, value in dataset.info().items():
-        typer.echo(f"{name:<16} {value}")
 
 
 @app.command("pretrain", cls=Spaced)
@@ -187,24 +135,43 @@ def report_results(
     ),
     markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
     csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
+    ] = None,
+    media: Annotated[
+        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
+    ] = "first",
 ) -> None:
-    """Shows the mean over seeds of every task and method, with its 95 % interval.
+    """Shows the mean over seeds of every task and method, and writes a page about all runs.
 
-    Markdown and CSV also have every policy: doing nothing, random, prior actor, WPT.
+    The page is one file that needs no network: the paper's tables beside yours, aggregates with
+    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
+    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
+    prior actor, WPT.
     """
     from wpt_agents.zoo import report
+    from wpt_agents.zoo.page import write_page
     from wpt_agents.zoo.stages import console
 
     results = report.read_results(folder)
     if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows, policies = report.summarise(results), report.policies(results)
+    as_markdown = f"{report.markdown(rows)}\n{report.policy_markdown(policies)}"
     if csv:
         typer.echo(report.policy_csv(policies), nl=False)
     elif markdown:
-        typer.echo(f"{report.markdown(rows)}\n{report.policy_markdown(policies)}", nl=False)
+        typer.echo(as_markdown, nl=False)
     else:
+        page = (out or folder / "report") / "index.html"
+        write_page(folder, page, media)
+        page.with_name("report.md").write_text(as_markdown)
+        page.with_name("policies.csv").write_text(report.policy_csv(policies))
         console.print(report.summary_table(rows))
+        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
+
+
+app.command("bench")(bench)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Non-curated data: trajectories without rewards, of noise or of noised scripts, as a dataset.
+"""Non-curated data: trajectories of noise, noised policies or curiosity, without rewards.
 
 Example::
 
@@ -7,13 +7,15 @@ Example::
 
 import json
 import os
+import shutil
 import warnings
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -22,59 +24,21 @@ import gymnasium as gym
 import numpy as np
 import wpt_envs
 from gymnasium import spaces
+from tqdm.auto import tqdm
 
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.exploration import EXPLORERS
+from wpt_agents.names import unknown_name
 from wpt_agents.trajectory import Trajectory
+from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions, scripted_actions
+from wpt_agents.zoo.curious import Expedition, explore_each
+from wpt_agents.zoo.policies import SavedPolicy, load_policy, sees_states
 from wpt_agents.zoo.progress import progress
 
-COLOURS = ("white", "pink", "ou-4", "ou-16", "ou-64")  # ou-n: correlated over n steps
-AMPLITUDES = (0.3, 1.5)  # standard deviation, drawn once an episode, before clipping to [-1, 1]
+BEHAVIOURS = ("random", "noise", "scripted", "policy", *EXPLORERS)
 SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
 MAX_STEPS = 1000  # where an environment without a time limit is cut
 EPISODES_A_JOB = 4
-
-Act = Callable[[np.ndarray, dict[str, Any], int], np.ndarray]
-"""(obs, info, step) -> action (A,) in [-1, 1]."""
-
-
-def coloured_noise(rng: np.random.Generator, colour: str, length: int, width: int) -> np.ndarray:
-    """Stationary noise of unit variance: white, pink (1/f), or Ornstein-Uhlenbeck.
-
-    :return: (length, width)
-    """
-    white = rng.standard_normal((length, width))
-    if colour == "white":
-        return white
-    if colour == "pink":
-        frequency = np.maximum(np.fft.rfftfreq(length), 1 / length)
-        gain = frequency**-0.5
-        gain /= np.sqrt((gain[:-1] ** 2).mean())
-        return np.fft.irfft(np.fft.rfft(white, axis=0) * gain[:, None], n=length, axis=0)
-    keep = np.exp(-1 / int(colour.removeprefix("ou-")))
-    noise = white.copy()
-    for step in range(1, length):
-        noise[step] = keep * noise[step - 1] + np.sqrt(1 - keep**2) * white[step]
-    return noise
-
-
-def noise_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Act, str]:
-    """An episode's worth of noise of a random colour and amplitude, and its name."""
-    colour, amplitude = str(rng.choice(COLOURS)), rng.uniform(*AMPLITUDES)
-    noise = np.clip(amplitude * coloured_noise(rng, colour, length, width), -1, 1)
-    return lambda obs, info, step: noise[step], f"{colour} noise, amplitude {amplitude:.2f}"
-
-
-def scripted_actions(rng: np.random.Generator, task: str, sigma: float) -> tuple[Act, str]:
-    """Meta-World's own scripted policy with Gaussian noise, and its name."""
-    from metaworld.policies import ENV_POLICY_MAP  # loads a simulator
-
-    policy = ENV_POLICY_MAP[f"{wpt_envs.TASKS[task].name}-v3"]()  # type: ignore[abstract]
-
-    def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
-        action = policy.get_action(np.asarray(info["state"], np.float64))
-        return np.clip(action + rng.normal(0, sigma, len(action)), -1, 1)
-
-    return act, f"scripted policy, sigma {sigma}"
 
 
 def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
@@ -94,42 +58,89 @@ def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Tra
 
 
 @dataclass(frozen=True)
+class Plan:
+    """How the episodes of a collection come about, apart from the task.
+
+    :param behaviour: one of `BEHAVIOURS`
+    :param env: keyword arguments of `gymnasium.make`
+    :param rewards: whether to keep the rewards
+    :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
+    :param policy: a saved policy, see `wpt_agents.zoo.policies.load_policy`
+    :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
+    """
+
+    seed: int = 0
+    behaviour: str = "noise"
+    env: Mapping[str, Any] = field(default_factory=dict)
+    rewards: bool = False
+    sigmas: tuple[float, ...] = SIGMAS
+    policy: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def label(self) -> dict[str, Any]:
+        """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
+        always, default = ("seed", "behaviour", "env"), vars(Plan())
+        told = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
+        return json.loads(json.dumps(told))
+
+    def sigma(self, episode: int) -> float:
+        """The noise of an episode."""
+        return self.sigmas[episode % len(self.sigmas)]
+
+
+@dataclass(frozen=True)
 class Job:
     """Consecutive episodes of one task, all that a worker needs to know of them."""
 
     task: str
     first: int
     count: int
-    seed: int
-    behaviour: str
-    env: Mapping[str, Any] = field(default_factory=dict)
+    plan: Plan
 
 
 def play(job: Job) -> list[Trajectory]:
     """The episodes of a job: a function of the job alone."""
-    scripted = job.behaviour == "scripted" and _has_script(job.task)
-    env = gym.make(job.task, **job.env, **({"state_in_info": True} if scripted else {}))
-    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
-        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    with closing(env), warnings.catch_warnings():
+    with closing(make_env(job.task, job.plan)) as env, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
         episodes = range(job.first, job.first + job.count)
         return [_play_episode(env, job, episode) for episode in episodes]
 
 
+def make_env(task: str, plan: Plan) -> gym.Env:
+    """The task with actions in [-1, 1], telling its state to those who need it."""
+    told = plan.behaviour == "scripted" and _has_script(task)
+    told = told or (plan.policy is not None and sees_states(plan.policy))
+    env = gym.make(task, **plan.env, **({"state_in_info": True} if told else {}))
+    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env
+
+
 def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
-    task = zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
-    source = np.random.SeedSequence([job.seed, task, episode])
-    rng = np.random.default_rng(source)
-    if job.behaviour == "scripted" and _has_script(job.task):
-        act, name = scripted_actions(rng, job.task, SIGMAS[episode % len(SIGMAS)])
-    else:
-        assert env.action_space.shape is not None
-        act, name = noise_actions(rng, env.action_space.shape[0], MAX_STEPS)
+    plan, task = job.plan, zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
+    source = np.random.SeedSequence([plan.seed, task, episode])
+    assert env.action_space.shape is not None
+    act, name = _actions(
+        np.random.default_rng(source), job.task, plan, episode, env.action_space.shape[0]
+    )
     played = record(env, act, int(source.generate_state(1)[0]))
-    row = wpt_envs.TASKS.get(job.task)
-    robot = row.embodiment if row else None
-    return replace(played, reward=None, embodiment=robot, task=job.task, source=name)
+    reward = played.reward if plan.rewards else None
+    return replace(played, reward=reward, embodiment=_robot(job.task), task=job.task, source=name)
+
+
+def _actions(
+    rng: np.random.Generator, task: str, plan: Plan, episode: int, width: int
+) -> tuple[Act, str]:
+    if plan.behaviour == "policy":
+        assert plan.policy is not None
+        sigma = plan.sigma(episode)
+        name = f"policy {Path(plan.policy).name}, sigma {sigma}"
+        return SavedPolicy(rng, plan.policy, sigma, width), name
+    if plan.behaviour == "random":
+        return random_actions(rng, width, MAX_STEPS)
+    if plan.behaviour == "scripted" and _has_script(task):
+        return scripted_actions(rng, task, plan.sigma(episode))
+    return noise_actions(rng, width, MAX_STEPS)
 
 
 def collect(
@@ -141,6 +152,11 @@ def collect(
     behaviour: str = "noise",
     env: Mapping[str, Any] | None = None,
     progress_bar: bool = True,
+    *,
+    rewards: bool = False,
+    sigmas: Sequence[float] = SIGMAS,
+    policy: str | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> TrajectoryDataset:
     """Plays `episodes` of each task and stores them; what `path` holds already is kept.
 
@@ -149,27 +165,88 @@ def collect(
 
     :param path: a folder; a finished one is returned as it is, half of one is continued
     :param tasks: ids for `gymnasium.make`
-    :param behaviour: "noise", or "scripted": Meta-World's scripts with noise, elsewhere "noise"
+    :param behaviour: "noise", of random colour and strength; "random", uniform; "scripted",
+        Meta-World's scripts with noise, elsewhere "noise"; "policy", a saved one with noise; "icm"
+        or "plan2explore", a curious agent for each task
     :param env: keyword arguments of `gymnasium.make`
+    :param rewards: store the rewards, too
+    :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, in turn
+        by episode
+    :param policy: a WPT model file, or one of SB3's as "sac:expert.zip"; takes images, or states
+        where the environment tells them
+    :param settings: keywords of WPT for a curious agent, beside `exploration.EXPLORE`
     """
-    _check(tasks, episodes, behaviour)
-    env = dict(env or {})
-    told = {"tasks": list(tasks), "episodes": episodes, "seed": seed, "behaviour": behaviour}
-    dataset = _open(Path(path), {**told, "env": env})
+    _check(tasks, episodes, behaviour, policy)
+    plan = Plan(
+        seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
+    )
+    told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
+    dataset = _open(Path(path), told)
+    total, before = len(tasks) * episodes, len(dataset)
+    bar = progress(total, "collect", "episodes", before, hide=not progress_bar or before == total)
+    with bar, dataset:
+        if behaviour in EXPLORERS:
+            _collect_curious(dataset, tasks, episodes, plan, workers, bar)
+        else:
+            _collect_played(dataset, tasks, episodes, plan, workers, bar)
+    return TrajectoryDataset.open(path)
+
+
+def _collect_played(
+    dataset: TrajectoryDataset,
+    tasks: Sequence[str],
+    episodes: int,
+    plan: Plan,
+    workers: int,
+    bar: "tqdm[None]",
+) -> None:
     jobs = [
-        Job(task, first, min(EPISODES_A_JOB, episodes - first), seed, behaviour, env)
+        Job(task, first, min(EPISODES_A_JOB, episodes - first), plan)
         for at, task in enumerate(tasks)
         for first in range(_done(dataset, at, episodes), episodes, EPISODES_A_JOB)
     ]
-    total = len(tasks) * episodes
-    bar = progress(total, "collect", "episodes", len(dataset), hide=not progress_bar or not jobs)
-    with bar, dataset:
-        for trajectories in _played(jobs, workers):
-            for trajectory in trajectories:
-                dataset.append(trajectory)
-            dataset.flush()
-            bar.update(len(trajectories))
-    return TrajectoryDataset.open(path)
+    for trajectories in _played(jobs, workers):
+        for trajectory in trajectories:
+            dataset.append(trajectory)
+        dataset.flush()
+        bar.update(len(trajectories))
+
+
+def _collect_curious(
+    dataset: TrajectoryDataset,
+    tasks: Sequence[str],
+    episodes: int,
+    plan: Plan,
+    workers: int,
+    bar: "tqdm[None]",
+) -> None:
+    """Each task's agent plays in a folder beside the data, which is taken in when it is done."""
+    trips = [
+        Expedition(
+            task,
+            episodes,
+            plan.seed,
+            plan.behaviour,
+            dataset.path / f"exploring-{zlib.crc32(task.encode()):08x}",
+            partial(make_env, task, plan),
+            plan.settings,
+            _robot(task),
+            plan.rewards,
+        )
+        for at, task in enumerate(tasks)
+        if _done(dataset, at, episodes) < episodes
+    ]
+    finished = (len(tasks) - len(trips)) * episodes
+
+    def moved(stored: int) -> None:
+        bar.update(finished + stored - bar.n)
+
+    for found in explore_each(trips, workers, moved):
+        dataset.extend(found.subset(range(len(dataset) % episodes, episodes)))
+        dataset.flush()
+    moved(len(trips) * episodes)
+    for folder in dataset.path.glob("exploring-*"):
+        shutil.rmtree(folder)
 
 
 def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
@@ -177,16 +254,25 @@ def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
     return min(max(len(dataset) - at * episodes, 0), episodes)
 
 
-def _check(tasks: Sequence[str], episodes: int, behaviour: str) -> None:
+def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | None) -> None:
     if not tasks or len(set(tasks)) < len(tasks) or episodes < 1:
         raise ValueError(
             f"collect wants different tasks and at least 1 episode of each, got {list(tasks)} "
             f"and {episodes}"
         )
-    if behaviour not in ("noise", "scripted"):
-        raise ValueError(f"No behaviour {behaviour!r}. There are: noise, scripted.")
+    if behaviour not in BEHAVIOURS:
+        raise unknown_name("behaviour", behaviour, BEHAVIOURS)
     if behaviour == "scripted" and not any(map(_has_script, tasks)):
         raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
+    if (behaviour == "policy") != (policy is not None):
+        raise ValueError("The behaviour 'policy', and no other, wants policy=FILE (--policy FILE).")
+    if policy is not None:
+        load_policy(policy)  # says what is wrong with it
+
+
+def _robot(task: str) -> str | None:
+    row = wpt_envs.TASKS.get(task)
+    return row.embodiment if row else None
 
 
 def _has_script(task: str) -> bool:
@@ -202,7 +288,7 @@ def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     if not label.exists() and len(dataset) == 0:
         label.write_text(json.dumps(told, indent=1))
     found = json.loads(label.read_text()) if label.exists() else {}
-    differ = [key for key in told if found.get(key) != told[key]]
+    differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]
     if differ:
         raise ValueError(
             f"{path} holds something else than this collection (different: {', '.join(differ)}); "

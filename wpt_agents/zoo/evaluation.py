@@ -16,7 +16,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.zoo.collect import Act, record
+from wpt_agents.zoo.behaviours import Act
+from wpt_agents.zoo.collect import record
 from wpt_agents.zoo.progress import progress
 from wpt_agents.zoo.statistics import mean_interval
 

@@ -34,10 +34,17 @@ class Method:
 METHODS = {
     "wpt": Method(),
     "scratch": Method(False, False, {"offline_ratio": 0.0, "guidance": 0.0}),
+    "pretrain-only": Method(wpt={"offline_ratio": 0.0, "guidance": 0.0}),
     "no-guidance": Method(wpt={"guidance": 0.0}),
     "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
 }
+ABLATION = {
+    "scratch": "none",
+    "pretrain-only": "P",
+    "no-guidance": "P+ER",
+    "wpt": "P+ER+G",
+}  # Fig. 5
 
 
 @dataclass(frozen=True)

@@ -218,6 +218,17 @@ def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
     return Preset.of(given)
 
 
+def keywords(settings: Sequence[str]) -> dict[str, Any]:
+    """Keywords of WPT from "key=value" each, every name valid, or ValueError."""
+    given: dict[str, Any] = {}
+    for title, section in (pair for text in settings for pair in _setting(text).items()):
+        for name in section:
+            if title != "wpt" or name not in wpt_keywords():
+                raise unknown_name("WPT keyword", name, wpt_keywords())
+        given |= section
+    return given
+
+
 def _setting(text: str) -> dict[str, dict[str, Any]]:
     """Reads 'learn.frames=1000' as {'learn': {'frames': 1000}}; without a dot it is WPT's."""
     key, equals, value = text.partition("=")

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from rich.table import Table
 
-from wpt_agents.zoo.presets import preset_folder
+from wpt_agents.zoo.aggregates import references, score_of
 from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval
 
 POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
@@ -37,9 +37,21 @@ class Row:
     paper: float | None
 
 
+def read_runs(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """Every finished run below `folder` and its result, in the order of their paths."""
+    return [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
+
+
 def read_results(folder: Path) -> list[dict[str, Any]]:
-    """Every finished run below `folder`, in the order of their paths."""
-    return [json.loads(path.read_text()) for path in sorted(folder.glob("**/result.json"))]
+    """The results of `read_runs`."""
+    return [result for _, result in read_runs(folder)]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}); delete it and run again") from None
 
 
 def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:
@@ -47,17 +59,12 @@ def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:
     groups: dict[tuple[str, str, str, int], list[float]] = defaultdict(list)
     for result in results:
         group = result["task"], result["method"], result["preset"], result["frames"]
-        groups[group].append(_score(result))
+        groups[group].append(score_of(result))
     paper = paper_scores()
     return [
         Row(*group, len(scores), *mean_interval(scores), paper.get(group[:2]))
         for group, scores in sorted(groups.items())
     ]
-
-
-def _score(result: Mapping[str, Any]) -> float:
-    score = result["scores"]["WPT"]
-    return score["success_rate"] if result["metric"] == "success" else score["mean"]
 
 
 @dataclass(frozen=True)
@@ -135,13 +142,11 @@ def _by_method(item: tuple[tuple[str, str, int, str, str], Any]) -> tuple[Any, .
 
 def paper_scores() -> dict[tuple[str, str], float]:
     """(task, method) -> the paper's score at 150,000 frames."""
-    scores = {}
-    for path in sorted((preset_folder() / "references").glob("table*.csv")):
-        with open(path, newline="") as file:
-            for row in csv.DictReader(file):
-                if row["samples"] == "150000" and row["score"]:
-                    scores[row["task"], row["method"]] = float(row["score"])
-    return scores
+    return {
+        (row.task, row.method): row.score
+        for row in references()
+        if row.samples == 150_000 and row.score is not None
+    }
 
 
 def interval_text(low: float | None, high: float | None) -> str:

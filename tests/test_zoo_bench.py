@@ -1,0 +1,68 @@
+import json
+
+import pytest
+import torch
+from torch import nn
+from typer.testing import CliRunner
+
+from wpt_agents.networks import FromPixel, UpConv
+from wpt_agents.zoo.__main__ import app
+from wpt_agents.zoo.bench import policy, profile, replay, timing
+
+KEYS = {
+    *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
+    *("gflop_per_s", "ceiling_gflop_per_s", "share_of_ceiling", "rss_mb"),
+}
+
+
+def test_the_model_bench_prints_a_json_object_for_each_case():
+    ran = CliRunner().invoke(app, ["bench", "model", "--quick", "--json"])
+    assert ran.exit_code == 0, ran.output
+    rows = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [row["what"] for row in rows] == ["world model", "whole update"]
+    for row in rows:
+        assert set(row) >= KEYS
+        assert row["gflop_per_s"] == pytest.approx(row["gflop"] / row["median_s"])
+    alone, whole = rows
+    assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
+
+
+def test_work_is_counted_as_the_layers_are_defined():
+    # 3 x 5 by 5 x 7 is 2 * 105; backward the same twice, once without a gradient of the input
+    layer, x = nn.Linear(5, 7), torch.ones(3, 5)
+    assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(2 * 2 * 105 / 1e9)
+    up, pixels = UpConv(4, 2, 6), torch.ones(3, 4, 5, 5)  # each of 5 x 5 pixels meets 6 x 6 weights
+    work = 2 * 3 * 25 * 4 * 2 * 36
+    assert timing.gflop(lambda: up(pixels)) == pytest.approx(work / 1e9)
+    one, pixel = FromPixel(4, 2, 5), torch.ones(3, 4, 1, 1)
+    assert timing.gflop(lambda: one(pixel)) == pytest.approx(2 * 3 * 4 * 2 * 25 / 1e9)
+    forwards = {kind.forward for kind in (UpConv, FromPixel)}
+    assert nn.ConvTranspose2d.forward not in forwards and len(forwards) == 2  # fast ones are back
+
+
+def test_the_median_leaves_the_warm_up_out():
+    calls = []
+    timing.seconds(lambda: calls.append(0), repetitions=3, warmup=2)
+    assert len(calls) == 5
+
+
+def test_the_other_cases_yield_rows():
+    (acting,) = policy.rows(quick=True)
+    assert acting["batch"] == 1 and acting["median_s"] > 0
+    (sampling,) = replay.rows(quick=True)
+    assert sampling["image_mb"] == pytest.approx(3 * 501 * 64 * 64 * 3 / 2**20)
+    every, *top = profile.rows(quick=True)
+    assert every["count"] > sum(row["count"] for row in top) > 0
+    shares = [row["share"] for row in top]
+    assert shares == sorted(shares, reverse=True) and sum(shares) < 1
+
+
+def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
+    def missing(name):
+        raise ModuleNotFoundError(f"No module named {name!r}", name="h5py")
+
+    monkeypatch.setattr("wpt_agents.zoo.bench.command.importlib.import_module", missing)
+    ran = CliRunner().invoke(app, ["bench", "data"])
+    assert isinstance(ran.exception, ValueError) and "h5py" in str(ran.exception)
+    ran = CliRunner().invoke(app, ["bench", "--quick"])
+    assert ran.exit_code == 0 and "bench data left out: it needs h5py" in ran.stderr

@@ -1,0 +1,91 @@
+"""How much of the walker's states each way of exploring sees, at equal frames.
+
+The measure: cells of a histogram over torso height (0 to 1.6 m, 16 bins), pitch (a full turn, 24
+bins) and horizontal speed (-4 to 4 m/s, 16 bins) that at least one step ended in; what lies outside
+counts in the outermost bins.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from wpt_agents.exploration import EXPLORE, EXPLORERS
+from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions
+from wpt_agents.zoo.collect import record
+
+TASK = "wpt/dmc-walker-stand-v0"
+BEHAVIOURS = ("random", "noise", "icm", "plan2explore")
+EPISODES = 20  # of 500 steps of 2 frames: 20,000 frames
+SMALL = {  # quick enough for a processor
+    **EXPLORE,
+    "size": "debug",
+    "batch_length": 16,
+    "train_ratio": 8,  # an update of 8 x 16 replayed steps every 16 collected ones
+    "imagine_horizon": 10,
+}
+LOW, HIGH, BINS = np.array([0, -np.pi, -4]), np.array([1.6, np.pi, 4]), np.array([16, 24, 16])
+
+
+class Watched(gym.Wrapper):
+    """Keeps the simulator's state after every step."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.states: list[np.ndarray] = []
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One step."""
+        result = self.env.step(action)
+        self.states.append(result[-1]["state"])
+        return result
+
+
+def coverage(states: np.ndarray) -> int:
+    """How many cells the walker's states lie in.
+
+    :param states: (N, 24), dm_control's observation: xx and xz of each body's orientation, the
+        torso's first; the torso's height; the joints' velocities, of which the second is rootx's
+    """
+    pitch = np.arctan2(states[:, 1], states[:, 0])
+    place = np.stack([states[:, 14], pitch, states[:, 16]], 1)
+    cells = np.floor((place - LOW) / (HIGH - LOW) * BINS).astype(int).clip(0, BINS - 1)
+    return len(np.unique(cells, axis=0))
+
+
+def explore(behaviour: str, seed: int, episodes: int, **settings: Any) -> np.ndarray:
+    """The states (N, 24) that a way of exploring passes through."""
+    learns = behaviour in EXPLORERS
+    size = 64 if learns else 16  # who does not look needs no picture
+    made = gym.make(TASK, rendering="fast", state_in_info=True, image_size=size)
+    with closing(Watched(made)) as env:
+        if learns:
+            model = EXPLORERS[behaviour]("WPTPolicy", env, max_action_dim=6, seed=seed, **settings)
+            for _ in model.explore(episodes):
+                pass
+        else:
+            actions = {"noise": noise_actions, "random": random_actions}[behaviour]
+            for episode in range(episodes):
+                rng = np.random.default_rng([seed, episode])
+                act: Act = actions(rng, 6, 500)[0]
+                record(env, act, int(rng.integers(2**31)))
+        return np.stack(env.states)
+
+
+def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
+    """The cells that each behaviour occupies, seed by seed."""
+    for behaviour in BEHAVIOURS:
+        for seed in range(1 if quick else 3):
+            start = time.process_time()
+            states = explore(behaviour, seed, 2 if quick else EPISODES, **SMALL)
+            yield {
+                "behaviour": behaviour,
+                "seed": seed,
+                "frames": 2 * len(states),
+                "cells, half way": coverage(states[: len(states) // 2]),
+                "cells": coverage(states),
+                "cpu seconds": round(time.process_time() - start),
+            }

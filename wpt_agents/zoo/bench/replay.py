@@ -1,0 +1,48 @@
+"""A batch from memory, and the memory that the images take."""
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from wpt_agents.replay import ReplayBuffer
+from wpt_agents.trajectory import Trajectory
+from wpt_agents.zoo.bench.timing import resident_mb, seconds
+
+LENGTH, ACTIONS = 500, 6
+
+
+def rows(quick: bool = False) -> Iterator[dict]:
+    """One row a number of stored images: what they alone take, and what the process grew by."""
+    for frames in (2_000,) if quick else (10_000, 100_000):
+        before = resident_mb()
+        replay = filled(frames)
+        held = resident_mb() - before
+        sample = partial(replay.sample, 16, 64, ACTIONS, np.random.default_rng(0))
+        processor, wall = seconds(sample, 3 if quick else 100, warmup=3)
+        yield {
+            "what": "replay sample",
+            "frames": frames,
+            "batch": 16,
+            "length": 64,
+            "threads": 1,
+            "median_s": processor,
+            "wall_s": wall,
+            "image_mb": sum(t.image.nbytes for t in replay.trajectories) / 2**20,
+            "held_mb": held,
+            "rss_mb": resident_mb(),
+        }
+
+
+def filled(frames: int) -> ReplayBuffer:
+    """Episodes of 500 steps, as many as make `frames` images."""
+    rng, replay = np.random.default_rng(0), ReplayBuffer()
+    for _ in range(frames // (LENGTH + 1)):
+        replay.add(
+            Trajectory(
+                rng.integers(0, 256, (LENGTH + 1, 64, 64, 3), np.uint8),
+                rng.uniform(-1, 1, (LENGTH, ACTIONS)).astype(np.float32),
+                rng.normal(size=LENGTH).astype(np.float32),
+            )
+        )
+    return replay

@@ -1,0 +1,146 @@
+"""What retrieval finds in a mixed store, and what the index costs at the paper's size.
+
+Queries are the first images of fresh episodes, as in fine-tuning; the search is given neither the
+robot's name nor its action width. Data and model are kept in `runs/bench/retrieval`.
+"""
+
+import resource
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from wpt_envs.tasks import TASKS
+
+from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.retrieval import Retriever
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo.collect import collect
+
+FOLDER = Path("runs") / "bench" / "retrieval"
+DMC = ("cartpole-swingup", "acrobot-swingup", "cheetah-run", "walker-run", "quadruped-run")
+METAWORLD = (
+    *("assembly", "button-press-topdown", "coffee-pull", "door-open", "drawer-close", "hammer"),
+    *("pick-place", "plate-slide", "soccer", "window-open"),
+)
+TASK_IDS = [f"wpt/dmc-{name}-v0" for name in DMC] + [f"wpt/metaworld-{n}-v0" for n in METAWORLD]
+LOOK = {"rendering": "fast"}
+EPISODES, STEPS, NEAREST, QUERIES = 20, 400, 10, 10
+MODEL = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
+PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
+
+Embed = Callable[[np.ndarray], np.ndarray]  # (n, 64, 64, 3) uint8 -> (n, E) float32
+
+
+class Queries(NamedTuple):
+    """First images of fresh episodes."""
+
+    image: np.ndarray  # (N, 64, 64, 3) uint8
+    task: list[str]
+
+
+def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
+    """The share of the nearest that are of the query's own kind, then time and memory."""
+    if quick:
+        yield index_cost(2_000, 64)
+        return
+    dataset = collect(FOLDER / "data", TASK_IDS, EPISODES, 0, 2, "scripted", LOOK)
+    asked = fresh_queries(TASK_IDS, QUERIES)
+    trained = WPT.pretrain(
+        dataset, steps=STEPS, seed=0, run_dir=FOLDER / "model", device="cpu", progress_bar=True,
+        **MODEL,
+    )  # fmt: skip
+    encoders: dict[str, Embed] = {f"pre-trained, {STEPS} updates": trained.policy.embed}
+    for seed in range(3):
+        encoders[f"untrained, seed {seed}"] = WPT(
+            "WPTPolicy", seed=seed, device="cpu", **MODEL
+        ).embed
+    encoders["raw pixels"] = pixels
+    for name, embed in encoders.items():
+        yield {"features": name, **shares(dataset, embed, asked, NEAREST)}
+    yield index_cost(*PAPER)
+
+
+def pixels(image: np.ndarray) -> np.ndarray:
+    """(n, 64, 64, 3) uint8 -> (n, 12288) float32."""
+    return image.reshape(len(image), -1).astype(np.float32)
+
+
+def fresh_queries(tasks: list[str], number: int) -> Queries:
+    """The first images of `number` episodes of each task, of seeds that collecting does not use."""
+    found = []
+    for task in tasks:
+        with closing(gym.make(task, **LOOK)) as env:
+            found += [env.reset(seed=10**6 + i)[0] for i in range(number)]
+    return Queries(np.stack(found), [task for task in tasks for _ in range(number)])
+
+
+def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> dict[str, Any]:
+    """How many of the k nearest are of the query's own robot (DMControl) or task (Meta-World)."""
+    retriever = Retriever.build(dataset, embed, "bench")
+    robots, tasks = np.array(dataset.embodiments), np.array(dataset.tasks)
+    own: dict[str, list[float]] = {"dmc": [], "metaworld": []}
+    chance: dict[str, list[float]] = {"dmc": [], "metaworld": []}
+    for task, feature in zip(asked.task, embed(asked.image), strict=True):
+        row = TASKS[task]
+        same = robots == row.embodiment if row.suite == "dmc" else tasks == task
+        own[row.suite].append(float(same[retriever.search(feature, k)[0]].mean()))
+        chance[row.suite].append(float(same.mean()))
+    return {
+        "queries": len(asked.task),
+        "own robot, DMControl": round(float(np.mean(own["dmc"])), 3),
+        "by chance": round(float(np.mean(chance["dmc"])), 3),
+        "own task, Meta-World": round(float(np.mean(own["metaworld"])), 3),
+        "by chance ": round(float(np.mean(chance["metaworld"])), 3),
+    }
+
+
+class _Blank:
+    """As much of a dataset as the index looks at: black first images."""
+
+    def __init__(self, length: int) -> None:
+        self.length, self.embodiments = length, [None] * length
+        self.action_dims = np.full(length, 6)
+
+    def __len__(self) -> int:
+        return self.length
+
+    def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
+        for at in range(0, self.length, batch):
+            yield np.zeros((min(batch, self.length - at), 64, 64, 3), np.uint8)
+
+
+def index_cost(trajectories: int, width: int) -> dict[str, Any]:
+    """Seconds and peak memory of building and searching, in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_index_cost, trajectories, width).result()
+
+
+def _index_cost(trajectories: int, width: int) -> dict[str, Any]:
+    rng, before = np.random.default_rng(0), _peak()
+
+    def embed(image: np.ndarray) -> np.ndarray:
+        return rng.standard_normal((len(image), width), np.float32)
+
+    start = time.process_time()
+    retriever = Retriever.build(_Blank(trajectories), embed, "bench")  # type: ignore[arg-type]
+    built = time.process_time()
+    for query in embed(np.zeros(10)):
+        retriever.search(query, 500, action_dim=6)
+    searched = time.process_time()
+    return {
+        "features": f"index of {trajectories:,} x {width:,}",
+        "cpu seconds to build": round(built - start, 1),
+        "cpu seconds a search": round((searched - built) / 10, 3),
+        "peak MiB": round(_peak()),
+        "of which imports": round(before),
+    }
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

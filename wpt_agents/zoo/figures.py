@@ -1,0 +1,141 @@
+"""The page's figures, drawn by matplotlib as SVG whose colours are the page's, light or dark."""
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")  # no display
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Placeholders that matplotlib draws with and `svg` replaces by the page's CSS variables.
+INK, MUTED, GRID = "#010101", "#020202", "#030303"
+SERIES = ("#a10001", "#a10002", "#a10003", "#a10004", "#a10005", "#a10006")
+VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"} | {
+    colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, 1)
+}
+STYLE = {
+    **{"svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9},
+    **{"text.color": INK, "axes.edgecolor": GRID, "axes.labelcolor": MUTED},
+    **{"xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": MUTED},
+    **{"axes.grid": True, "grid.color": GRID, "grid.linewidth": 0.6, "axes.titlesize": 9.5},
+    **{
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+    },
+}
+Band = tuple[np.ndarray, np.ndarray, np.ndarray]  # middle, low, high, each (N,)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method's line with its band.
+
+    :param x: (N,)
+    :param band: the middle and the ends of its 95 % interval, (N,) each
+    """
+
+    label: str
+    x: np.ndarray
+    band: Band
+
+
+def svg(figure: Figure, title: str) -> str:
+    """The figure as an `<svg>` element for a page; `title` is what a screen reader says."""
+    file = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": title}):  # ids that differ between figures
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    plt.close(figure)
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(
+        r'<svg[^>]*viewBox="([^"]*)"[^>]*>', rf'<svg viewBox="\1" {_LABEL}>', text, count=1
+    )
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
+    for colour, variable in VARIABLES.items():
+        text = text.replace(colour, variable)
+    return text.replace("ARIA", title.replace("&", "&amp;").replace('"', "&quot;"), 1)
+
+
+_LABEL = 'role="img" aria-label="ARIA" xmlns:xlink="http://www.w3.org/1999/xlink"'
+
+
+def _axes(width: float = 3.6, height: float = 2.5) -> tuple[Figure, Axes]:
+    figure = plt.figure(figsize=(width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def colour_of(label: str, labels: Sequence[str]) -> str:
+    """A series' colour, the same in every figure that has the same series."""
+    return SERIES[list(labels).index(label) % len(SERIES)]
+
+
+def lines(
+    title: str,
+    x_label: str,
+    y_label: str,
+    given: Sequence[Line],
+    labels: Sequence[str],
+    marks: Mapping[str, float] | None = None,
+    step: bool = False,
+) -> str:
+    """Lines with their bands.
+
+    :param labels: all series of the page, for their colours
+    :param marks: horizontal lines by name
+    :param step: draw stairs, as for a distribution
+    """
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _axes()
+        how = "steps-post" if step else "default"
+        for line in given:
+            colour = colour_of(line.label, labels)
+            middle, low, high = line.band
+            marker = "" if step else "o"
+            axes.plot(line.x, middle, color=colour, lw=1.8, marker=marker, ms=3, drawstyle=how)
+            axes.fill_between(
+                line.x, low, high, color=colour, alpha=0.18, lw=0, step="post" if step else None
+            )
+        for name, value in (marks or {}).items():
+            axes.axhline(value, color=MUTED, ls=(0, (4, 3)), lw=1)
+            axes.annotate(
+                name,
+                (0.99, value),
+                xycoords=("axes fraction", "data"),
+                ha="right",
+                va="bottom",
+                fontsize=7.5,
+                color=MUTED,
+            )
+        axes.set(title=title, xlabel=x_label, ylabel=y_label)
+        axes.xaxis.set_major_locator(plt.MaxNLocator(5))
+        if not step:
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        return svg(figure, title)
+
+
+def bars(
+    title: str,
+    y_label: str,
+    given: Mapping[str, tuple[float, float, float]],
+    colours: Sequence[str],
+) -> str:
+    """A bar for each name, with its 95 % interval."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _axes()
+        for place, (value, low, high) in enumerate(given.values()):
+            error = [[max(value - low, 0)], [max(high - value, 0)]]
+            axes.bar(place, value, 0.62, color=colours[place], alpha=0.85)
+            axes.errorbar(place, value, error, color=INK, capsize=3, lw=1)
+        texts = [f"{name}\n{value:.2f}" for name, (value, *_) in given.items()]
+        axes.set_xticks(range(len(given)), texts)
+        axes.set(title=title, ylabel=y_label)
+        axes.grid(False, axis="x")
+        return svg(figure, title)

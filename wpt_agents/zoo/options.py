@@ -1,0 +1,42 @@
+"""What several commands share: options, and how they take several values."""
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+
+class Spaced(TyperCommand):
+    """Lets an option take several values at once: `--tasks a b` for `--tasks a --tasks b`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Repeats the option's name before each further value."""
+        several = {o for p in self.params if p.multiple for o in p.opts}  # type: ignore[attr-defined]
+        spread: list[str] = []
+        option, given = None, False
+        for arg in args:
+            if arg.startswith("-"):
+                option, given = (arg if arg in several else None), False
+            elif option and given:
+                spread.append(option)
+            else:
+                given = True
+            spread.append(arg)
+        return super().parse_args(ctx, spread)
+
+
+Suite = Annotated[str, typer.Option(help="dmc, or another suite of `list`.")]
+Tasks = Annotated[
+    list[str],
+    typer.Option(help="Names or patterns, e.g. `walker-run 'cheetah-*'`. None: the paper's."),
+]
+Settings = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Changes the preset: a keyword of WPT (`gamma=0.98`), or `section.key=value` "
+        "(`pretrain.steps=500`, `env.rendering=near`).",
+    ),
+]
+Workers = Annotated[int, typer.Option(min=1, help="Processes that collect data.")]

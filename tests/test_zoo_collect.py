@@ -125,6 +125,16 @@ def test_a_finished_dataset_is_returned_without_playing(tmp_path, monkeypatch):
     assert len(collect(tmp_path / "data", [DOT], 2, workers=1, progress_bar=False)) == 2
 
 
+def test_a_set_aside_episode_is_not_played_again(tmp_path, monkeypatch):
+    dataset = collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False)
+    shard = next(dataset.path.glob("shard-*.bin"))
+    shard.write_bytes(shard.read_bytes()[:-50])  # the last episode's end
+    assert len(dataset.validate(set_aside=True)) == 1
+    assert (len(dataset), dataset.appended) == (2, 3)
+    monkeypatch.setattr(module, "play", lambda job: pytest.fail("played again"))
+    assert len(collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False)) == 2
+
+
 def test_a_folder_with_other_settings_is_refused(tmp_path):
     collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
     with pytest.raises(ValueError, match=r"different: episodes, seed.*another path"):

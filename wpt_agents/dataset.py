@@ -361,6 +361,11 @@ class TrajectoryDataset(Conversions):
             "compression": images * self.image_size**2 * 3 / stored if images else 1.0,
         }
 
+    @property
+    def appended(self) -> int:
+        """How many trajectories were ever appended: those here, and those set aside."""
+        return len(self) + len(read_damaged(self.path))
+
     def validate(self, progress_bar: bool = False, set_aside: bool = False) -> list[Damage]:
         """Reads every byte and names the trajectories that are damaged; [] if all is well.
 

@@ -97,8 +97,9 @@ class Conversions:
         store: Any = cls  # `create`, `open` and `append` are TrajectoryDataset's
         there = Path(path).exists() and any(Path(path).iterdir())
         dataset = store.open(path) if there else store.create(path, episodes.image_size)
-        done = len(dataset)
-        if done > len(episodes) or (done and _label(dataset[-1]) != _label(episodes[done - 1])):
+        done = dataset.appended
+        known = done > 0 and len(dataset) == done  # else the last one may be set aside
+        if done > len(episodes) or (known and _label(dataset[-1]) != _label(episodes[done - 1])):
             raise ValueError(
                 f"{path} holds {done} trajectories of another source or with other labels; "
                 "convert to another folder"

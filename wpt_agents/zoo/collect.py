@@ -182,7 +182,7 @@ def collect(
     )
     told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
     dataset = _open(Path(path), told)
-    total, before = len(tasks) * episodes, len(dataset)
+    total, before = len(tasks) * episodes, dataset.appended
     bar = progress(total, "collect", "episodes", before, hide=not progress_bar or before == total)
     with bar, dataset:
         if behaviour in EXPLORERS:
@@ -242,7 +242,7 @@ def _collect_curious(
         bar.update(finished + stored - bar.n)
 
     for found in explore_each(trips, workers, moved):
-        dataset.extend(found.subset(range(len(dataset) % episodes, episodes)))
+        dataset.extend(found.subset(range(dataset.appended % episodes, episodes)))
         dataset.flush()
     moved(len(trips) * episodes)
     for folder in dataset.path.glob("exploring-*"):
@@ -251,7 +251,7 @@ def _collect_curious(
 
 def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
     """How many episodes of the task number `at` the dataset holds: they come task by task."""
-    return min(max(len(dataset) - at * episodes, 0), episodes)
+    return min(max(dataset.appended - at * episodes, 0), episodes)
 
 
 def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | None) -> None:
@@ -285,7 +285,7 @@ def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     label = path / "collect.json"
     begun = path.exists() and any(path.iterdir())
     dataset = TrajectoryDataset.open(path) if begun else TrajectoryDataset.create(path)
-    if not label.exists() and len(dataset) == 0:
+    if not label.exists() and dataset.appended == 0:
         label.write_text(json.dumps(told, indent=1))
     found = json.loads(label.read_text()) if label.exists() else {}
     differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]

@@ -114,7 +114,8 @@ class Shared:
             return dataset
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
-            found = len(TrajectoryDataset.open(self.data_path)) if self.data_path.exists() else 0
+            there = self.data_path.exists()
+            found = TrajectoryDataset.open(self.data_path).appended if there else 0
         except ValueError:
             found = 0  # `collect` says what is wrong
         state = "reused" if found == wanted else f"continued at {found} of" if found else "making"

@@ -7,10 +7,8 @@ runs share. `result.json` is written last: where it stands, the run is finished.
 import fcntl
 import json
 import platform
-import shlex
 import shutil
 import subprocess
-import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -92,7 +90,7 @@ def _begin(job: Run) -> dict[str, Any]:
     (job.folder / "error.txt").unlink(missing_ok=True)
     (job.folder / "config.yaml").write_text(yaml.safe_dump(job.config(), sort_keys=False))
     write_json(job.folder / "system.json", system())
-    (job.folder / "command.txt").write_text(shlex.join([sys.executable, *sys.orig_argv[1:]]) + "\n")
+    (job.folder / "command.txt").write_text(job.command + "\n")
     try:
         return _work(job)
     except Exception:

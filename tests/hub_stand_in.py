@@ -95,7 +95,6 @@ def hub(monkeypatch, tmp_path):
     module = pytest.importorskip("huggingface_hub", reason="the extra `hub` is not installed")
     server = Hub()
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    monkeypatch.setattr(module.constants, "ENDPOINT", server.address)
     api = type("Api", (module.HfApi,), {})
     monkeypatch.setattr(module, "HfApi", lambda: api(endpoint=server.address, token="hf_x"))
     download = module.snapshot_download

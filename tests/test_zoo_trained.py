@@ -10,7 +10,7 @@ import pytest
 import yaml
 from hub_stand_in import hub  # noqa: F401  (a fixture)
 from run_folders import make_run
-from test_zoo import DOT, call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import DOT, SECTIONS, call, dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.hub import card, pull, push
@@ -45,12 +45,9 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     assert len(imageio.imread(video)) >= DOT.frames
     model = shutil.copy(folder / "model.zip", tmp_path / "alone.zip")
     words = ["--task", "dmc-dot", "--episodes", "1"]
-    with monkeypatch.context() as plain:  # the toy has no defaults of its own
-        plain.setattr(
-            "wpt_agents.zoo.trained._config",
-            lambda _: {"env": {"rendering": "fast", "action_repeat": 1}},
-        )
-        assert call(monkeypatch, "eval", model, *words) == 0
+    assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
+    monkeypatch.setattr("wpt_agents.zoo.trained._config", lambda _: {"env": SECTIONS["env"]})
+    assert call(monkeypatch, "eval", model, *words) == 0
 
 
 def test_a_moved_out_is_not_done_again(tmp_path):

@@ -194,6 +194,7 @@ def run_benchmark(
     """
     from wpt_agents.zoo.benchmark import run_all
     from wpt_agents.zoo.engines import Resources, run_on
+    from wpt_agents.zoo.estimate import check_space, summary
     from wpt_agents.zoo.plan import make_plan, show_plan
     from wpt_agents.zoo.watch import watch as show_standings
 
@@ -201,10 +202,12 @@ def run_benchmark(
     jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if dry_run:
         show_plan(jobs, force)
+        typer.echo(summary(jobs))
         return
     if watch:
         show_standings(jobs)
         return
+    check_space(jobs)
     if engine == "none":
         done = run_all(jobs, force)
     else:

@@ -101,7 +101,7 @@ def _begin(job: Run) -> dict[str, Any]:
 def check_folder(job: Run, force: bool) -> None:
     """Refuses to take a folder that is not this run's."""
     path = job.folder / "config.yaml"
-    others = {each.name for each in job.folder.glob("*")} - {"lock"}
+    others = {each.name for each in job.folder.glob("*")} - {"lock", "log.txt"}
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:

@@ -103,6 +103,7 @@ def test_no_engine_is_imported_unless_asked_for():
 def ray():
     module = pytest.importorskip("ray", reason="the extra `ray` is not installed")
     places = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")  # on a busy machine
     module.init(
         num_cpus=2,
         include_dashboard=False,

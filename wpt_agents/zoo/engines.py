@@ -178,7 +178,7 @@ class Ray:
         if not self.ray.is_initialized():
             try:
                 self.ray.init(address=given.address or None, log_to_driver=False)
-            except (ConnectionError, ValueError, RuntimeError) as error:
+            except Exception as error:  # Ray raises a bare one when its processes do not start
                 raise ValueError(
                     f"No Ray cluster answers at {given.address!r} ({error}); "
                     "start one with `ray start --head`, or leave --address out"

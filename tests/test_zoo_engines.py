@@ -16,6 +16,8 @@ from wpt_agents.zoo import engines, stages
 from wpt_agents.zoo.engines import Local, Ray, Resources, Slurm, run_on
 from wpt_agents.zoo.watch import standing
 
+PLACES = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])  # for workers
+
 
 def tick():
     time.sleep(0.02)
@@ -102,13 +104,12 @@ def test_no_engine_is_imported_unless_asked_for():
 @pytest.fixture(scope="module")
 def ray():
     module = pytest.importorskip("ray", reason="the extra `ray` is not installed")
-    places = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
     os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")  # on a busy machine
     module.init(
         num_cpus=2,
         include_dashboard=False,
         log_to_driver=False,
-        runtime_env={"env_vars": {"PYTHONPATH": places, "OMP_NUM_THREADS": "1"}},
+        runtime_env={"env_vars": {"PYTHONPATH": PLACES, "OMP_NUM_THREADS": "1"}},
     )
     yield module
     module.shutdown()
@@ -133,8 +134,9 @@ def test_ray_refuses_to_wait_for_what_the_cluster_does_not_have(ray):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_slurm_through_submitit_goes_on_after_a_preemption(tmp_path):
+def test_slurm_through_submitit_goes_on_after_a_preemption(tmp_path, monkeypatch):
     pytest.importorskip("submitit", reason="the extra `slurm` is not installed")
+    monkeypatch.setenv("PYTHONPATH", PLACES)
     one, engine = job(tmp_path), Slurm(Resources(partition="local"))
     preempted = []
 

@@ -25,7 +25,9 @@ def make_run(out, task, seed=0, method="wpt", returns=(10.0, 20.0), frames=1000,
         },
         **{"seconds": {"learn": 1.5, "evaluate": 0.5}, "commit": "0123456789ab"},
     }
-    (folder / "config.yaml").write_text(yaml.safe_dump({"task": task, "seed": seed}))
+    env = {"action_repeat": 2, "rendering": "near"}
+    config = {"task": f"wpt/{task}-v0", "seed": seed, "env": env}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
     (folder / "command.txt").write_text(f"python -m wpt_agents.zoo run --tasks {task}\n")
     (folder / "system.json").write_text(json.dumps({"commit": "0123456789ab"}))
     evaluations = np.linspace(0, 1, 3)[:, None] * np.array(returns)

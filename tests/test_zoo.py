@@ -320,7 +320,10 @@ def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", [[], ["list"], ["collect"], ["pretrain"], ["run"], ["report"]])
+COMMANDS = ("list", "collect", "pretrain", "run", "eval", "enjoy", "push", "pull", "report")
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_every_command_has_help(command, monkeypatch, capsys):
     assert call(monkeypatch, *command, "--help") == 0
     assert "Usage" in capsys.readouterr().out

@@ -115,6 +115,7 @@ def test_tasks_are_found_by_name_id_or_pattern(patterns, names):
 
 def test_no_pattern_means_the_papers_22_tasks():
     assert len(find_tasks("dmc", [])) == 22
+    assert len(find_tasks("robotics", [])) == 12  # none of which is the paper's
 
 
 @pytest.mark.parametrize(("suite", "name"), [("dmc", "walker-rum"), ("dmd", "walker-run")])

@@ -1,4 +1,4 @@
-"""The commands: python -m wpt_agents.zoo {list, pretrain, run, report, bench}, and `data_commands`.
+"""The commands of `python -m wpt_agents.zoo`.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -97,7 +97,10 @@ def run_benchmark(
     ] = "1",
     method: Annotated[
         list[str],
-        typer.Option(help="wpt, scratch, no-guidance, no-rehearsal, no-pretrain; several allowed."),
+        typer.Option(
+            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain; several "
+            "allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
+        ),
     ] = ["wpt"],  # noqa: B006
     frames: Annotated[
         int | None, typer.Option(help="Simulator frames of fine-tuning (learn.frames).")
@@ -109,6 +112,23 @@ def run_benchmark(
     device: Device = "auto",
     force: Annotated[bool, typer.Option(help="Start finished runs anew.")] = False,
     dry_run: Annotated[bool, typer.Option(help="Show the plan and do nothing.")] = False,
+    watch: Annotated[
+        bool, typer.Option(help="Only show where these runs stand, made by another terminal.")
+    ] = False,
+    engine: Annotated[
+        str,
+        typer.Option(
+            help="none: one run after the other, here; local: each in a process of its own, "
+            "`--workers` at a time; ray: on a cluster; slurm: as jobs of submitit."
+        ),
+    ] = "none",
+    cpus: Annotated[int, typer.Option(min=1, help="Of each run, on an engine.")] = 1,
+    gpus: Annotated[float, typer.Option(min=0, help="Of each run; may be 0.5 with Ray.")] = 0,
+    memory_gb: Annotated[float, typer.Option(min=0, help="Of each run, on Ray and Slurm.")] = 4,
+    hours: Annotated[float, typer.Option(help="Slurm's limit; the run is sent again.")] = 24,
+    retries: Annotated[int, typer.Option(min=0, help="After a worker's death.")] = 2,
+    address: Annotated[str, typer.Option(help="Of the Ray cluster. None: one here.")] = "",
+    partition: Annotated[str, typer.Option(help="Slurm's; `local` does without Slurm.")] = "",
 ) -> None:
     """Runs the whole method: collect, pre-train, index, fine-tune, evaluate.
 
@@ -118,14 +138,117 @@ def run_benchmark(
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
     from wpt_agents.zoo.benchmark import run_all
+    from wpt_agents.zoo.engines import Resources, run_on
+    from wpt_agents.zoo.estimate import check_space, summary
     from wpt_agents.zoo.plan import make_plan, show_plan
+    from wpt_agents.zoo.watch import watch as show_standings
 
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if dry_run:
         show_plan(jobs, force)
-    elif not run_all(jobs, force):
+        typer.echo(summary(jobs))
+        return
+    if watch:
+        show_standings(jobs)
+        return
+    check_space(jobs)
+    if engine == "none":
+        done = run_all(jobs, force)
+    else:
+        limits = cpus, gpus, memory_gb, hours, retries
+        done = run_on(engine, jobs, force, Resources(workers, *limits, address, partition))
+    if not done:
         raise typer.Exit(1)
+
+
+RunFolder = Annotated[
+    Path, typer.Argument(help="A run folder, moved or pulled too, or a model file (.zip).")
+]
+ForTask = Annotated[
+    str, typer.Option(help="`dmc-walker-run`; only for a model file without its run folder.")
+]
+Policy = Annotated[str, typer.Option(help="wpt, or prior: the actor that guided it.")]
+
+
+@app.command("eval")
+def evaluate_model(
+    run: RunFolder,
+    task: ForTask = "",
+    policy: Policy = "wpt",
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    device: Device = "auto",
+) -> None:
+    """Plays a trained model on its task and shows its returns. Needs no dataset.
+
+    Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
+    """
+    from wpt_agents.zoo.report import interval_text, number
+    from wpt_agents.zoo.trained import find_trained
+
+    trained = find_trained(run, task)
+    score = trained.evaluate(trained.load(policy, device), episodes, seed)
+    mean, low, high = score.interval
+    typer.echo(f"task             {trained.task}")
+    typer.echo(f"mean return      {number(mean)}")
+    typer.echo(f"95 % interval    {interval_text(low, high)}")
+    typer.echo(f"returns          {', '.join(map(number, score.returns))}")
+    if score.successes:
+        typer.echo(f"success          {score.as_dict()['success_rate']:.2f}, at the last step")
+
+
+@app.command("enjoy")
+def enjoy_model(
+    run: RunFolder,
+    task: ForTask = "",
+    policy: Policy = "wpt",
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial state.")] = 10_000,
+    out: Annotated[Path, typer.Option(help="The video.")] = Path("enjoy.mp4"),
+    size: Annotated[int, typer.Option(min=64, help="Its width; a multiple of 16.")] = 256,
+    device: Device = "auto",
+) -> None:
+    """Films an episode of a trained model to an mp4, which any browser plays.
+
+    Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
+    """
+    from wpt_agents.zoo.report import number
+    from wpt_agents.zoo.trained import find_trained
+
+    if size % 16:
+        raise ValueError(f"--size {size}: a video's width must be a multiple of 16.")
+    trained = find_trained(run, task)
+    total = trained.record(trained.load(policy, device), out, seed, size)
+    typer.echo(f"Return {number(total)}. Video: {out.resolve()}")
+
+
+@app.command("push")
+def push_run(
+    run: Annotated[Path, typer.Argument(help="A finished run's folder.")],
+    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
+    private: Annotated[bool, typer.Option(help="Only you can see it.")] = False,
+) -> None:
+    """Uploads a run to the Hugging Face hub: model, configuration, scores, video and a card.
+
+    Log in first: `hf auth login`.
+    """
+    from wpt_agents.zoo.hub import push
+
+    typer.echo(f"Pushed: {push(run, name, private)}")
+
+
+@app.command("pull")
+def pull_run(
+    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
+    out: Annotated[Path | None, typer.Option(help="A new folder. None: the repository's name.")] = (
+        None
+    ),
+) -> None:
+    """Downloads a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`."""
+    from wpt_agents.zoo.hub import pull
+
+    folder = pull(name, out or Path(name.rpartition("/")[2]))
+    typer.echo(f"Pulled: {folder.resolve()}. Watch it: python -m wpt_agents.zoo enjoy {folder}")
 
 
 @app.command("report")

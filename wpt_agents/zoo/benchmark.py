@@ -7,10 +7,8 @@ runs share. `result.json` is written last: where it stands, the run is finished.
 import fcntl
 import json
 import platform
-import shlex
 import shutil
 import subprocess
-import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -92,7 +90,7 @@ def _begin(job: Run) -> dict[str, Any]:
     (job.folder / "error.txt").unlink(missing_ok=True)
     (job.folder / "config.yaml").write_text(yaml.safe_dump(job.config(), sort_keys=False))
     write_json(job.folder / "system.json", system())
-    (job.folder / "command.txt").write_text(shlex.join([sys.executable, *sys.orig_argv[1:]]) + "\n")
+    (job.folder / "command.txt").write_text(job.command + "\n")
     try:
         return _work(job)
     except Exception:
@@ -103,7 +101,7 @@ def _begin(job: Run) -> dict[str, Any]:
 def check_folder(job: Run, force: bool) -> None:
     """Refuses to take a folder that is not this run's."""
     path = job.folder / "config.yaml"
-    others = {each.name for each in job.folder.glob("*")} - {"lock"}
+    others = {each.name for each in job.folder.glob("*")} - {"lock", "log.txt"}
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:

@@ -116,7 +116,9 @@ def lines(
             )
         axes.set(title=title, xlabel=x_label, ylabel=y_label)
         axes.xaxis.set_major_locator(plt.MaxNLocator(5))
-        if not step:
+        if step:
+            axes.set_ylim(-0.02, 1.02)
+        else:
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         return svg(figure, title)
 
@@ -137,5 +139,7 @@ def bars(
         texts = [f"{name}\n{value:.2f}" for name, (value, *_) in given.items()]
         axes.set_xticks(range(len(given)), texts)
         axes.set(title=title, ylabel=y_label)
+        if not any(high > 0 for _, _, high in given.values()):
+            axes.set_ylim(0, 1)  # nothing to see: an axis around 0 would look like a fault
         axes.grid(False, axis="x")
         return svg(figure, title)

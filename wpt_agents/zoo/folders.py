@@ -11,8 +11,6 @@ import numpy as np
 from wpt_agents.zoo import report
 from wpt_agents.zoo.aggregates import Experiment
 
-PICTURES = ("predictions.png", "retrieval.png")
-
 
 @dataclass(frozen=True)
 class Finished:
@@ -38,16 +36,14 @@ class Finished:
         return f"{self.result['task']}-{one.method}-{one.preset}-{one.frames}-{self.result['seed']}"
 
     def media(self) -> dict[str, str]:
-        """Video and pictures as data URIs, by their file's name without its ending."""
+        """Video and prediction strip as data URIs, by their file's name without its ending."""
         found = {}
         if (video := self.folder / "policy.mp4").exists():
             found["policy"] = data_uri("video/mp4", video.read_bytes())
-        for name in PICTURES:
-            if (path := self.folder / name).exists():
-                small = imageio.imwrite(
-                    "<bytes>", imageio.imread(path)[..., :3], extension=".jpg", quality=88
-                )
-                found[path.stem] = data_uri("image/jpeg", small)
+        if (strip := self.folder / "predictions.png").exists():
+            pixels = imageio.imread(strip)[..., :3]
+            small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
+            found["predictions"] = data_uri("image/jpeg", small)
         return found
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:

@@ -39,4 +39,7 @@ Settings = Annotated[
         "(`pretrain.steps=500`, `env.rendering=near`).",
     ),
 ]
-Workers = Annotated[int, typer.Option(min=1, help="Processes that collect data.")]
+Workers = Annotated[
+    int,
+    typer.Option(min=1, help="Processes that collect data; runs at a time of `--engine local`."),
+]

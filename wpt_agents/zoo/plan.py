@@ -1,6 +1,8 @@
 """From the words of a command to the runs that it asks for, all checked before any begins."""
 
 import json
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,9 +49,17 @@ ABLATION = {
 }  # Fig. 5
 
 
+def this_command() -> str:
+    """The command that this process was started with."""
+    return shlex.join([sys.executable, *sys.orig_argv[1:]])
+
+
 @dataclass(frozen=True)
 class Run:
-    """One run, fully told before it begins."""
+    """One run, fully told before it begins.
+
+    :param command: what the user typed, whichever process does the run
+    """
 
     task: Task
     seed: int
@@ -60,6 +70,7 @@ class Run:
     workers: int = 2
     device: str = "auto"
     data: Path | None = None
+    command: str = field(default_factory=this_command, compare=False)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

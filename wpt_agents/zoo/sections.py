@@ -171,7 +171,7 @@ def ablation(suite: str, found: Mapping[Experiment, Scores], names: Names) -> st
                 values[part] = aggregates.estimate(mean, scores)
         title = f"{SUITES[suite]}: ablation, {budget}"
         colours = [figures.colour_of(names_of[part], names.all) for part in values]
-        y_label = f"normalised mean, {len(common)} tasks"
+        y_label = f"normalised mean, tasks: {len(common)}"
         drawn.append(figures.bars(title, y_label, values, colours))
     return "".join(drawn)
 

@@ -12,12 +12,13 @@ from wpt_agents.names import unknown_name
 def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
     """The tasks of a suite that match: 'walker-run', 'dmc-walker-run', or a pattern, 'walker-*'.
 
-    No pattern: the paper's tasks of the suite. A prefix may name another suite, 'dmc-walker-run'.
+    No pattern: the paper's tasks of the suite, or all of them if the paper has none. A prefix may
+    name another suite, 'dmc-walker-run'.
     """
     if suite not in (suites := {row.suite for row in table.TASKS.values()}):
         raise unknown_name("suite", suite, suites)
     if not patterns:
-        return table.suite(suite)
+        return table.suite(suite) or table.suite(suite, paper_only=False)
     found: dict[str, Task] = {}
     for pattern in patterns:
         name = pattern.removeprefix("wpt/").removesuffix("-v0")

@@ -148,7 +148,7 @@ def retrieval_sheet(
             first = next(dataset.subset([i]).first_observations())[0]
             _draw(axis, first, COLOURS["WPT"] if same else COLOURS["prior actor"], 2)
             axis.set_title(
-                f"#{i}  d {distance:.2f}\n{_kind(task, robot)}", fontsize=6.5, color=INK, pad=3
+                f"#{i}  d {distance:.3g}\n{_kind(task, robot)}", fontsize=6.5, color=INK, pad=3
             )
     robots = "blue: the query's own robot, orange: another"
     _finish(figure, path, f"First images and the nearest in {dataset.path} ({robots})")
@@ -162,7 +162,7 @@ def _draw(axis: plt.Axes, image: np.ndarray, colour: str = MUTED, width: float =
 
 def _finish(figure: plt.Figure, path: str | os.PathLike[str], title: str) -> None:
     figure.suptitle(title, fontsize=9, color=INK)
-    figure.tight_layout(rect=(0, 0, 1, 1 - 0.1 / figure.get_figheight()), pad=0.4)
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.2 / figure.get_figheight()), pad=0.4)
     figure.savefig(path, dpi=130, bbox_inches="tight")
     plt.close(figure)
 

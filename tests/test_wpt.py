@@ -18,6 +18,7 @@ from debug_agent import (
     weights,
 )
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
@@ -447,3 +448,47 @@ def test_every_episode_is_judged_before_it_is_replayed(monkeypatch):
     )
     model.learn(21)
     assert seen == [0, 1, 2]
+
+
+def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path):
+    model = pretrained(store, env=DotEnv()).learn(LENGTH)
+    model.save(tmp_path / "model")
+    with TrajectoryDataset.create(tmp_path / "other") as other:
+        other.extend(recorded(seed=i, actions=4) for i in range(4))
+        other.extend(recorded(seed=i) for i in range(3))
+    loaded = WPT.load(tmp_path / "model", env=DotEnv(), dataset=other)
+    assert sorted(loaded.learn(LENGTH).retrieved_ids) == [4, 5, 6]
+    model.set_dataset(other)
+    assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5, 6]
+    assert {t.action_dim for t in model.retrieved.trajectories} == {2}
+
+
+def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_path):
+    env = Monitor(ClockEnv(length=7))  # no spec: nothing says how long it lasts
+    model = pretrained(store, env=env, guidance=1, warmup_steps=0)
+    assert model._episode_length() == 500  # a guess, until an episode has been seen
+    model.learn(7)
+    assert model._episode_length() == 7
+    model.save(tmp_path / "model")
+    assert WPT.load(tmp_path / "model", env=ClockEnv(length=7))._episode_length() == 7
+    model.reset_task()
+    assert model._episode_length() == 500
+
+
+def test_another_task_starts_from_returns_of_no_known_scale():
+    model = agent(DotEnv())
+    model.policy.return_scale.fill_(1000)
+    model.reset_task()
+    assert model.policy.return_scale == 1
+
+
+def test_guidance_that_begins_later_has_a_clone_too(store):
+    model = pretrained(store, env=DotEnv(), guidance="linear(0,1,40)").learn(2 * LENGTH)
+    assert model.cloned
+
+
+def test_a_seed_that_was_set_is_saved(tmp_path):
+    model = agent(DotEnv())
+    model.set_random_seed(5)
+    model.save(tmp_path / "model")
+    assert WPT.load(tmp_path / "model").seed == 5

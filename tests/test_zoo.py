@@ -11,16 +11,18 @@ import pytest
 import toy_env
 import yaml
 from rich.console import Console
+from run_folders import make_run
 from scipy import stats
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from wpt_envs.tasks import TASKS, Task
 
+from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import benchmark, report, stages
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate
-from wpt_agents.zoo.plan import METHODS, Run
+from wpt_agents.zoo.plan import METHODS, Run, make_plan
 from wpt_agents.zoo.presets import Preset
 from wpt_agents.zoo.statistics import mean_interval
 
@@ -360,3 +362,28 @@ def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
     assert all(f"| {name} |" in told for name in ("doing nothing", "prior actor", "WPT"))
     assert call(monkeypatch, "report", tmp_path, "--csv") == 0
     assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")
+
+
+def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp_path):
+    make_run(tmp_path / "a", "dmc-dot")
+    make_run(tmp_path / "b", "dmc-dot")
+    with pytest.raises(ValueError, match="are the same run: report one of their folders"):
+        report.read_results(tmp_path)
+
+
+def test_runs_of_a_changed_preset_are_told_apart(tmp_path):
+    given = "dmc", ["walker-stand"], "debug", "1", ["wpt"]
+    plain, changed, longer = (
+        make_plan(*given, settings, tmp_path, 1, "cpu")[0].label
+        for settings in ([], ["gamma=0.9", "env.rendering=near"], ["learn.frames=9000"])
+    )
+    assert (plain, changed, longer) == ("debug", "debug env.rendering=near gamma=0.9", "debug")
+
+
+def test_data_that_have_grown_are_pretrained_on_anew(tmp_path):
+    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    before = job(tmp_path, data=own).shared.model_path
+    assert job(tmp_path, data=own).shared.model_path == before
+    with TrajectoryDataset.open(own) as dataset:
+        dataset.append(dataset[0])
+    assert job(tmp_path, data=own).shared.model_path != before

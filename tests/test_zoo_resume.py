@@ -7,8 +7,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from debug_agent import same, weights
@@ -20,8 +23,9 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo import benchmark
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.checkpoints import last_checkpoint
-from wpt_agents.zoo.evaluation import make_vec_env
+from wpt_agents.zoo.evaluation import EpisodeSeeds, make_vec_env
 from wpt_agents.zoo.progress import LearningBar
+from wpt_agents.zoo.stages import locked
 
 CHANGES = {
     "learn": {"frames": 150, "checkpoint_every": 25},
@@ -128,8 +132,87 @@ def test_what_came_after_the_checkpoint_is_forgotten(tmp_path, monkeypatch):
 def test_a_run_that_another_process_works_on_is_refused(tmp_path):
     one = job(tmp_path)
     one.folder.mkdir(parents=True)
-    with benchmark.locked(one.folder), pytest.raises(ValueError, match="by another process"):
+    with locked(one.folder / "lock"), pytest.raises(ValueError, match="by another process"):
         run(one)
+
+
+def test_force_does_not_walk_into_a_run_that_another_process_works_on(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(60, monkeypatch, one)
+    before = sorted(one.folder.rglob("*"))
+    with locked(one.folder / "lock"), pytest.raises(ValueError, match="by another process"):
+        run(one, force=True)
+    assert sorted(one.folder.rglob("*")) == before
+
+
+def test_leftovers_of_checkpoints_that_cannot_be_used_make_way(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    (one.folder / "replay" / "episode-000000.zip").unlink()
+    with pytest.warns(UserWarning, match="damaged and passed over"):
+        killed_at(30, monkeypatch, one)
+    assert [p.name for p in (one.folder / "checkpoints").iterdir()] == ["step-000000025"]
+    assert len(list((one.folder / "replay").iterdir())) == 1
+
+
+def test_the_checkpoint_at_the_end_is_not_written_twice(tmp_path, monkeypatch):
+    one, written = job(tmp_path, learn={"frames": 150, "checkpoint_every": 0}), []
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+            with pytest.raises(Killed):
+                run(one)
+        (state,) = one.folder.glob("checkpoints/*/state.json")
+        written.append((state.stat().st_ino, state.stat().st_mtime_ns))
+    assert written[0] == written[1]
+
+
+def test_training_and_evaluation_share_no_episode(tmp_path):
+    for seed in range(20):
+        one = job(tmp_path, seed=seed)
+        training = EpisodeSeeds(gym.make(DOT.id, action_repeat=1, rendering="fast"))
+        training.reset(seed=seed)
+        seeds = {seed} | {training.next_seed() for _ in range(200)}
+        final = {one.evaluation_seed + i for i in range(100)}
+        assert not seeds & final
+
+
+def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monkeypatch):
+    shared = job(tmp_path).shared
+    dataset, folder = shared.data(), shared.model_path
+
+    def other():
+        with locked(folder / "lock"):
+            begun.set()
+            time.sleep(0.3)
+            (folder / "done.json").write_text("{}")
+
+    begun, thread = threading.Event(), threading.Thread(target=other)
+    thread.start()
+    begun.wait()
+    monkeypatch.setattr(WPT, "pretrain", lambda *_, **__: pytest.fail("pre-trained twice"))
+    assert shared.model(dataset) == folder / "model.zip"
+    thread.join()
+
+
+def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("wpt_agents.wpt.EVERY", 100)
+    shared, update = job(tmp_path, pretrain={"steps": 300}).shared, WPT._update_world_model
+    dataset, taken = shared.data(), []
+
+    def dying(*args):
+        taken.append(0)
+        if len(taken) == 180:
+            raise Killed
+        return update(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WPT, "_update_world_model", dying)
+        with pytest.raises(Killed):
+            shared.model(dataset)
+    assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 3
+    shared.model(dataset)
+    assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 6
 
 
 def test_an_unfinished_run_of_other_settings_is_refused(tmp_path, monkeypatch):
@@ -164,21 +247,20 @@ def test_sigkill_at_random_moments_costs_nothing_that_was_kept(tmp_path):
     whole, broken = job(tmp_path / "whole", **CHANGES), job(tmp_path / "broken", **CHANGES)
     run(whole)
     script = SCRIPT.format(tests=str(Path(__file__).parent), out=str(tmp_path / "broken"))
-    rng, kills = random.Random(0), 0
-    while not (broken.folder / "result.json").exists():
+    rng, monitor = random.Random(0), broken.folder / "0.monitor.csv"
+    for episodes in (1, 2, 4, None):  # after which it is killed, at some moment of the next one
         child = subprocess.Popen(
             [sys.executable, "-c", script],
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
         )
-        patience = rng.uniform(4, 12) if kills < 5 else 300  # importing alone takes seconds
-        try:
-            _, said = child.communicate(timeout=patience)
-            assert child.returncode == 0, said.decode()
-        except subprocess.TimeoutExpired:
+        if episodes is not None:
+            while not monitor.exists() or monitor.read_text().count("\n") < 2 + episodes:
+                assert child.poll() is None, child.communicate()
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0, 0.2))
             child.send_signal(signal.SIGKILL)
-            child.communicate()
-            kills += 1
+        _, said = child.communicate(timeout=300)
+        assert child.returncode == (0 if episodes is None else -signal.SIGKILL), said.decode()
     assert_equal(left(broken.folder), left(whole.folder))
-    assert kills

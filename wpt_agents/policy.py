@@ -80,9 +80,9 @@ class WPTPolicy(BasePolicy):
         self.size, self.max_action_dim = size, max_action_dim
         self.zero_init_heads, self.actor_outscale = zero_init_heads, actor_outscale
         self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
-        self.reset_behavior()
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.ones(()))
+        self.reset_behavior()
         self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self.set_action_space(action_space)
 
@@ -96,6 +96,7 @@ class WPTPolicy(BasePolicy):
         self.target_critic = Critic(size).to(device).requires_grad_(False)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
+        self.return_scale.fill_(1)
 
     def set_action_space(self, action_space: spaces.Box) -> None:
         """Acts in this space from now on; entries past its width are masked everywhere."""

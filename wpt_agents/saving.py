@@ -29,6 +29,7 @@ COUNTERS = (  # where a model stands, besides its weights
     "credit",
     "cloned",
     "retrieved_ids",
+    "retrieved_of",
     "_windows_drawn",
     "_seen_length",
 )

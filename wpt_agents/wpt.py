@@ -180,6 +180,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         self.replay_buffer = ReplayBuffer()
         self.retrieved: ReplayBuffer | None = None
         self.retrieved_ids: list[int] = []
+        self.retrieved_of = ""  # the fingerprint of the dataset that they number
         self.pretrain_steps, self.episodes, self.updates = 0, 0, 0
         self.cloned, self.credit = False, 0.0
         self._rollout: Rollout | None = None
@@ -213,6 +214,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         """Seeds all that is drawn from now on, and the environment's next reset."""
         if seed is not None:
             self.seed = self.stream_seed = seed
+            self.hyperparameters = {**self.hyperparameters, "seed": seed}
         super().set_random_seed(seed)
 
     # ------------------------------------------------------------------ the data and the task
@@ -223,6 +225,8 @@ class WPT(Updates, Saving, BaseAlgorithm):
             return
         dataset = TrajectoryDataset.of(dataset)
         check_dataset(dataset, self.max_action_dim, self.batch_length)
+        if self.retrieved_of != dataset.fingerprint:
+            self.retrieved = None
         self.dataset = dataset
 
     @staticmethod
@@ -253,14 +257,14 @@ class WPT(Updates, Saving, BaseAlgorithm):
         self.policy.set_action_space(wrapped.action_space)
         if force_reset:
             self._last_obs = None
-        self._rollout = self._seen_length = None
+        self._rollout = None
         if self.seed is not None:
             wrapped.seed(self.seed)
 
     def reset_task(self) -> None:
         """Forgets the task and keeps the world model: replay, rewards, behaviour, retrieval."""
         self.replay_buffer, self.retrieved, self.retrieved_ids = ReplayBuffer(), None, []
-        self.cloned, self.credit = False, 0.0
+        self.cloned, self.credit, self._seen_length = False, 0.0, None
         self.policy.reset_behavior()
         self._setup_optimizers()
 
@@ -371,14 +375,15 @@ class WPT(Updates, Saving, BaseAlgorithm):
 
     def _retrieve(self, progress_bar: bool) -> None:
         """// Experience Retrieval: the R trajectories that begin most like the task, Eq. (5)."""
-        guided = parse_schedule(self.guidance)(0) > 0
         if self.dataset is None and self.retrieved_ids and self.offline_ratio:
             warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
-        if self.dataset is None or self.retrieved is not None or not (guided or self.offline_ratio):
+        wanted = self._guided() or self.offline_ratio
+        if self.dataset is None or self.retrieved is not None or not wanted:
             return
-        if not self.retrieved_ids or max(self.retrieved_ids) >= len(self.dataset):
+        if not self.retrieved_ids or self.retrieved_of != self.dataset.fingerprint:
             query = self.policy.embed(to_images(self._last_obs)[0][:1])[0]
             self.retrieved_ids = self._search(query, progress_bar)
+            self.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
         for trajectory in self.dataset.subset(self.retrieved_ids):
             self.retrieved.add(replace(trajectory, reward=None))
@@ -403,7 +408,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
 
     def _clone(self, progress_bar: bool) -> None:
         """// Behavior Cloning Policy Training, on the retrieved trajectories."""
-        if self.retrieved is None or self.cloned or parse_schedule(self.guidance)(0) == 0:
+        if self.retrieved is None or self.cloned or not self._guided():
             return
         policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
         optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
@@ -466,11 +471,16 @@ class WPT(Updates, Saving, BaseAlgorithm):
         return draw_window(probability, length, self._stream(WINDOW, self._windows_drawn))
 
     def _episode_length(self) -> int:
-        if self._seen_length is None:
-            assert self.env is not None
-            spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
-            self._seen_length = getattr(spec, "max_episode_steps", None) or 500
-        return self.episode_length or self._seen_length
+        """As given, or the longest so far, or what the environment says, or a guess."""
+        if length := self.episode_length or self._seen_length:
+            return length
+        assert self.env is not None
+        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+        return getattr(spec, "max_episode_steps", None) or 500
+
+    def _guided(self) -> bool:
+        """Whether the prior actor will ever drive: schedules are monotonous."""
+        return self.schedule(0) > 0 or self.schedule(sys.maxsize) > 0
 
     def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
         if self.cloned:

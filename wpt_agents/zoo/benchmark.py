@@ -4,7 +4,6 @@ A run collects, pre-trains, indexes, fine-tunes and evaluates; `wpt_agents.zoo.s
 runs share. `result.json` is written last: where it stands, the run is finished.
 """
 
-import fcntl
 import json
 import platform
 import shutil
@@ -25,6 +24,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures, report
@@ -41,7 +41,7 @@ from wpt_agents.zoo.checkpoints import (
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.progress import LearningBar
-from wpt_agents.zoo.stages import BASELINES, console, say, write_json
+from wpt_agents.zoo.stages import BASELINES, console, locked, say, write_json
 from wpt_agents.zoo.tasks import short_name
 
 PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
@@ -78,17 +78,26 @@ def run(job: Run, force: bool = False) -> dict[str, Any]:
     if done is not None:
         say("run", f"finished before, reused (--force starts anew)  [dim]{job.folder}")
         return done
-    if force:
-        shutil.rmtree(job.folder, ignore_errors=True)
-    job.folder.mkdir(parents=True, exist_ok=True)
-    with locked(job.folder):
+    with locked(job.folder / "lock"):
+        if force:
+            clear(job.folder)
         return _begin(job)
+
+
+def clear(folder: Path) -> None:
+    """Deletes what a run has left, all but its lock."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "lock":
+            path.unlink()
 
 
 def _begin(job: Run) -> dict[str, Any]:
     """Says in the folder what is being done, then does it."""
     (job.folder / "error.txt").unlink(missing_ok=True)
-    (job.folder / "config.yaml").write_text(yaml.safe_dump(job.config(), sort_keys=False))
+    with replacing(job.folder / "config.yaml") as temporary:
+        temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False))
     write_json(job.folder / "system.json", system())
     (job.folder / "command.txt").write_text(job.command + "\n")
     try:
@@ -112,19 +121,6 @@ def check_folder(job: Run, force: bool) -> None:
                 f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
                 "use another --out, or --force to replace it"
             )
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keeps a second process out of a run's folder; the lock ends with its process."""
-    with open(folder / "lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"{folder} is being worked on by another process: wait for it, or use another --out"
-            ) from None
-        yield
 
 
 class Clock:
@@ -153,6 +149,7 @@ def _work(job: Run) -> dict[str, Any]:
             start = job.shared.model(dataset)
     checkpoint = last_checkpoint(job.folder)
     if checkpoint is None:
+        remove_checkpoints(job.folder)  # damaged ones, or what others have left
         for name in LOGS:
             (job.folder / name).unlink(missing_ok=True)
     else:
@@ -294,7 +291,7 @@ def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) ->
         "suite": job.task.suite,
         "task": short_name(job.task),
         "method": job.method,
-        "preset": job.preset_name,
+        "preset": job.label,
         "seed": job.seed,
         "frames": job.preset.learn.frames,
         "steps": job.preset.steps,

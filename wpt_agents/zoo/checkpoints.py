@@ -174,7 +174,8 @@ class Checkpoints(BaseCallback):
 
     def _on_training_end(self) -> None:
         assert isinstance(self.model, WPT)
-        if self.model._last_obs is not None:  # None: an error ended it in the middle of an episode
+        interrupted = self.model._last_obs is None  # by an error, in the middle of an episode
+        if not interrupted and self.model.num_timesteps > self.written:
             write_checkpoint(self.model, self.run, self.seconds)
 
 
@@ -217,3 +218,11 @@ class ContinuedCSV(CSVOutputFormat):
         super().__init__(str(path))
         self.file.write(before)
         self.keys = before.partition("\n")[0].split(",") if before else []
+
+    def keep(self, rows: int) -> None:
+        """Drops all rows behind the first so many."""
+        self.file.seek(0)
+        lines = self.file.readlines()[: 1 + rows]
+        self.file.seek(0)
+        self.file.truncate()
+        self.file.writelines(lines)

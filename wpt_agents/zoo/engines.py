@@ -24,7 +24,7 @@ import torch
 from wpt_agents.names import unknown_name
 from wpt_agents.zoo import benchmark
 from wpt_agents.zoo.plan import METHODS, Run
-from wpt_agents.zoo.stages import console, say
+from wpt_agents.zoo.stages import console, locked, say
 from wpt_agents.zoo.watch import shown
 
 ENGINES = ("local", "ray", "slurm")
@@ -65,8 +65,10 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     runner = {"local": Local, "ray": Ray, "slurm": Slurm}[engine](given)
     left = [job for job in jobs if force or job.result() is None]
     for job in left if force else ():
-        shutil.rmtree(job.folder, ignore_errors=True)
-    shared = {job.shared.model_path: job for job in left if METHODS[job.method].needs_data}
+        with locked(job.folder / "lock"):
+            benchmark.clear(job.folder)
+    by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
+    shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
     say("engine", f"{engine}: {len(left)} of {len(jobs)} runs to do, {given.cpus} CPUs each")
     with shown(jobs) as tick:
         if errors := runner.map(make_shared, list(shared.values()), tick):

@@ -84,6 +84,9 @@ class Score:
         return cls(given["returns"], given["successes"])
 
 
+EPISODE = 2  # a purpose in a seed's derivation, beside `plan.EVALUATION`
+
+
 class EpisodeSeeds(gym.Wrapper):
     """Seeds each reset by the number of the episode, so that an episode depends on none before it.
 
@@ -99,10 +102,13 @@ class EpisodeSeeds(gym.Wrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Begins the next episode."""
         self.seed = self.seed if seed is None else seed
-        drawn = np.random.SeedSequence([self.seed, self.episode]).generate_state(1)
-        own = int(drawn[0] >> 1) if self.episode else self.seed
+        return self.env.reset(seed=self.next_seed(), options=options)
+
+    def next_seed(self) -> int:
+        """The seed of the next episode, which counts as begun."""
+        drawn = np.random.SeedSequence([self.seed, EPISODE, self.episode]).generate_state(1)
         self.episode += 1
-        return self.env.reset(seed=own, options=options)
+        return int(drawn[0] >> 1) if self.episode > 1 else self.seed
 
     def go_to_episode(self, number: int) -> None:
         """The next reset begins episode `number`."""

@@ -58,6 +58,7 @@ def this_command() -> str:
 class Run:
     """One run, fully told before it begins.
 
+    :param changes: of the preset, each "key=value"
     :param command: what the user typed, whichever process does the run
     """
 
@@ -70,11 +71,19 @@ class Run:
     workers: int = 2
     device: str = "auto"
     data: Path | None = None
+    changes: tuple[str, ...] = ()
     command: str = field(default_factory=this_command, compare=False)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise unknown_name("method", self.method, METHODS)
+
+    @property
+    def label(self) -> str:
+        """The preset's name and what was changed of it, but for `frames`, which stand apart."""
+        changes = [c for c in self.changes if not c.startswith("learn.frames=")]
+        own_data = [f"data={self.data.name}"] if self.data is not None else []
+        return " ".join([self.preset_name, *sorted(changes), *own_data])
 
     @property
     def folder(self) -> Path:
@@ -157,7 +166,7 @@ def make_plan(
     if data is not None:
         TrajectoryDataset.open(data)
     return [
-        Run(row, seed, method, preset, resolved, out, workers, device, data)
+        Run(row, seed, method, preset, resolved, out, workers, device, data, tuple(settings))
         for row in rows
         for method in methods
         for seed in parse_seeds(seeds)

@@ -38,8 +38,21 @@ class Row:
 
 
 def read_runs(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """Every finished run below `folder` and its result, in the order of their paths."""
-    return [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
+    """Every finished run below `folder` and its result, in the order of their paths.
+
+    :raises ValueError: a run that stands there twice, which would count as two seeds
+    """
+    runs = [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
+    seen: dict[tuple[Any, ...], Path] = {}
+    for path, result in runs:
+        one = tuple(result[name] for name in ("task", "method", "preset", "frames", "seed"))
+        if one in seen:
+            raise ValueError(
+                f"{seen[one]} and {path} are the same run: report one of their folders, or delete "
+                "one of them"
+            )
+        seen[one] = path
+    return runs
 
 
 def read_results(folder: Path) -> list[dict[str, Any]]:

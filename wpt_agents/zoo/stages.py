@@ -3,12 +3,13 @@
 They stand in `<out>/cache`, each named by a hash of all that it depends on.
 """
 
+import fcntl
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -17,13 +18,14 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from rich.console import Console
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import Task
 
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
+from wpt_agents.zoo.checkpoints import ContinuedCSV
 from wpt_agents.zoo.collect import collect
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, Score, evaluate
 from wpt_agents.zoo.presets import Preset
@@ -48,6 +50,25 @@ def key(*parts: Any) -> str:
     """A short hash of settings and of the library's version."""
     text = json.dumps([version("wpt-agents"), *parts], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+@contextmanager
+def locked(path: Path, wait: bool = False) -> Iterator[None]:
+    """Keeps other processes out while the block runs; the lock ends with its process.
+
+    :param path: a file that stands for what is locked
+    :param wait: until it is free, instead of refusing
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            raise ValueError(
+                f"{path.parent} is being worked on by another process: wait for it, or use "
+                "another --out"
+            ) from None
+        yield
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -99,7 +120,9 @@ class Shared:
     @property
     def data_source(self) -> str:
         """What the data are, however far `cache` is moved."""
-        return self.data_path.name if self.given_data is None else str(self.data_path)
+        if self.given_data is None:
+            return self.data_path.name
+        return f"{self.data_path} {TrajectoryDataset.open(self.data_path).fingerprint}"
 
     @property
     def pretraining(self) -> dict[str, Any]:
@@ -135,23 +158,29 @@ class Shared:
         """Stage 2: the file of the pre-trained model; half a pre-training is continued."""
         given, folder = self.preset.pretrain, self.model_path
         model, done = folder / "model.zip", folder / "done.json"
-        state = "reused" if done.exists() else "continued" if model.exists() else "making"
-        say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
-        if not done.exists():
-            start, logger = time.perf_counter(), configure(str(folder), ["csv", "tensorboard"])
-            with closing(logger):
-                WPT.pretrain(
-                    dataset,
-                    steps=given.steps,
-                    run_dir=folder,
-                    seed=given.seed,
-                    device=self.device,
-                    progress_bar=True,
-                    callback=writing_to(logger),
-                    **self.pretraining,
-                )
-            write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
+        with locked(folder / "lock", wait=True):
+            state = "reused" if done.exists() else "continued" if model.exists() else "making"
+            say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
+            if not done.exists():
+                start = time.perf_counter()
+                self._pretrain(dataset, folder)
+                write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
         return model
+
+    def _pretrain(self, dataset: TrajectoryDataset, folder: Path) -> None:
+        table = ContinuedCSV(folder / "progress.csv")
+        logger = Logger(str(folder), [table, TensorBoardOutputFormat(str(folder))])
+        with closing(logger):
+            WPT.pretrain(
+                dataset,
+                steps=self.preset.pretrain.steps,
+                run_dir=folder,
+                seed=self.preset.pretrain.seed,
+                device=self.device,
+                progress_bar=True,
+                callback=writing_to(logger, table),
+                **self.pretraining,
+            )
 
     def index(self, model: WPT) -> None:
         """Stage 3: the features of every first image, kept beside the dataset."""
@@ -180,10 +209,15 @@ BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
 }
 
 
-def writing_to(logger: Logger) -> Callable[[int, dict[str, float]], None]:
+def writing_to(logger: Logger, table: ContinuedCSV) -> Callable[[int, dict[str, float]], None]:
     """A callback of pre-training that logs the metrics' means over 50 updates."""
+    begun = False
 
     def write(step: int, metrics: dict[str, float]) -> None:
+        nonlocal begun
+        if not begun:  # what came after the checkpoint is made again
+            table.keep(rows=(step - 1) // 50)
+            begun = True
         for name, value in metrics.items():
             logger.record_mean(name, value)
         if step % 50 == 0:

@@ -54,8 +54,8 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 if {("wpt", "WPT"), other} <= t.keys()
             ]
             if pairs:
-                above = sum(ours.episodes_low > theirs.episodes_high for ours, theirs in pairs)
-                below = sum(ours.episodes_high < theirs.episodes_low for ours, theirs in pairs)
+                above = sum(report.above(ours, theirs) for ours, theirs in pairs)
+                below = sum(report.above(theirs, ours) for ours, theirs in pairs)
                 against.append({"name": name, "above": above, "below": below, "of": len(pairs)})
         if against:
             told.append(

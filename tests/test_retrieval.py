@@ -33,6 +33,18 @@ def test_the_search_equals_brute_force_across_chunks(monkeypatch):
     np.testing.assert_allclose(distances, np.sort(distance)[:100], rtol=1e-4)
 
 
+def test_the_share_of_the_nearest_that_are_of_ones_own_robot():
+    # at 0, 1, 2 a walker; at 10, 11 an arm: of two others each, walkers find 2 of 2, arms 1 of 2
+    places = np.array([[0.0], [1.0], [2.0], [10.0], [11.0]])
+    names = ["walker"] * 3 + ["arm"] * 2
+    one = Retriever(places, np.ones(5, int), names, "encoder")
+    assert one.own_share(k=2) == pytest.approx((3 * 2 + 2 * 1) / 10)
+    assert one.own_share(k=1) == 1
+    assert (
+        Retriever(places, np.ones(5, int), ["walker", None] * 2 + [None], "e").own_share() is None
+    )
+
+
 def test_fewer_candidates_than_asked_for_are_all_returned_once():
     indices, distances = retriever([[2.0], [1.0]]).search(np.zeros(1), k=500)
     assert indices.tolist() == [1, 0]

@@ -137,6 +137,22 @@ class Retriever:
         order = np.lexsort((indices, squared))[:k]  # equally near: in the dataset's order
         return indices[order], np.sqrt(squared[order])
 
+    def own_share(self, k: int = 10, queries: int = 100) -> float | None:
+        """How well the features tell robots apart, without their names or widths to help.
+
+        :param queries: trajectories to ask for, evenly spread, all if there are fewer
+        :return: the share of their `k` nearest others that are of the same name; None where fewer
+            than two robots are named
+        """
+        if len(set(self.embodiments) - {None}) < 2:
+            return None
+        asked = np.unique(np.linspace(0, len(self) - 1, queries).round().astype(int))
+        same = []
+        for i in asked:
+            near = self.search(self.features[i], k + 1)[0]
+            same += [self.embodiments[j] == self.embodiments[i] for j in near[near != i][:k]]
+        return float(np.mean(same))
+
     def _candidates(self, embodiment: str | None, action_dim: int | None) -> np.ndarray:
         wanted = np.ones(len(self), bool)
         if embodiment is not None:

@@ -188,7 +188,9 @@ class Shared:
         before = set(Path(model.dataset.path).iterdir())
         retriever = model.build_index(progress_bar=True)
         state = "made" if set(Path(model.dataset.path).iterdir()) - before else "reused"
-        say("index", f"{state}, {len(retriever)} first images  [dim]{model.dataset.path}")
+        share = retriever.own_share()
+        told = "" if share is None else f", {share:.0%} of the nearest are of the query's own robot"
+        say("index", f"{state}, {len(retriever)} first images{told}  [dim]{model.dataset.path}")
 
     def baseline(self, name: str, task: Task, seed: int) -> Score:
         """The score of doing nothing or of the random policy, played unless it is there."""

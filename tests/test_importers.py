@@ -190,6 +190,13 @@ def test_a_conversion_that_was_cut_short_goes_on_where_it_stopped(tmp_path):
         check_same(trajectory, chain(5 + seed, seed))
 
 
+def test_a_conversion_killed_while_its_folder_is_made_goes_on(tmp_path):
+    save_npz(tmp_path / "in/0.npz", chain(5))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/index.jsonl").touch()  # and no meta.json
+    assert len(TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", **SMALL)) == 1
+
+
 def test_a_dataset_of_another_source_is_not_added_to(tmp_path):
     for folder, name in (("a", "1"), ("b", "2")):
         save_npz(tmp_path / folder / f"{name}.npz", chain(5))

@@ -80,6 +80,13 @@ def test_actions_without_limits_are_refused():
         rescaled(np.zeros(3), [0.0], [1.0])
 
 
+@pytest.mark.parametrize("form", ["hdf5", "lerobot", "rlds"])
+@pytest.mark.parametrize("limit", ["low", "high"])
+def test_one_limit_without_the_other_is_refused(tmp_path, form, limit):
+    with pytest.raises(ValueError, match=r"low and high, .* belong together; got low=.* and high="):
+        open_episodes(tmp_path, form, **{limit: [1.0, 1.0]})
+
+
 def test_a_missing_package_is_asked_for_by_name():
     with pytest.raises(ImportError, match="Reading smoke needs nowhere_to_be: pip install"):
         needs("nowhere_to_be.found", "smoke")

@@ -102,6 +102,20 @@ def _resized(image: np.ndarray, size: int) -> np.ndarray:
     return pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
 
 
+def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """The actions' limits as arrays, None where neither is given.
+
+    :raises ValueError: one without the other
+    """
+    if low is None and high is None:
+        return None
+    if low is None or high is None:
+        raise ValueError(
+            f"low and high, the actions' limits, belong together; got low={low} and high={high}"
+        )
+    return np.asarray(low, np.float64), np.asarray(high, np.float64)
+
+
 def rescaled(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Actions of the range `low` to `high`, clipped to it, in [-1, 1]; 0 where both are equal.
 

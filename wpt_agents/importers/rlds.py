@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, as_images, needs, rescaled
+from wpt_agents.importers.episodes import Episodes, as_images, both_limits, needs, rescaled
 from wpt_agents.trajectory import Trajectory
 
 JPEG = b"\xff\xd8"
@@ -46,7 +46,8 @@ class RldsEpisodes(Episodes):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self._key, self._action, self._limits = image_key, action_key, (low, high)
+        self._key, self._action = image_key, action_key
+        self._limits = both_limits(low, high)
         self._folder = Path(folder)
         pattern = f"*-{split}.tfrecord*" if split else "*.tfrecord*"
         self._records = [
@@ -70,9 +71,8 @@ class RldsEpisodes(Episodes):
         image = self._images(steps, source)
         action = self._find(steps, self._action, source)
         action = np.asarray(action, np.float32).reshape(len(image), -1)[:-1]
-        low, high = self._limits
-        if low is not None and high is not None:
-            action = rescaled(action, np.asarray(low), np.asarray(high))
+        if self._limits:
+            action = rescaled(action, *self._limits)
         reward = steps.get("reward")
         return self._trajectory(
             image,

@@ -1,5 +1,6 @@
 """What every reader of a foreign format shares: its options, image and action conversion."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from importlib import import_module
@@ -14,6 +15,8 @@ from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
 
 class Episodes(ABC):
     """Somebody's episodes in a fixed order, each read and converted when asked for.
+
+    One of a single image holds no action and is left out, aloud.
 
     :param image_size: height and width to resize to
     :param rewards: whether to keep the rewards; pre-training needs none
@@ -64,6 +67,16 @@ class Episodes(ABC):
             )
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from error
+
+
+def warn_left_out(count: int, source: object) -> None:
+    """Says how many episodes of a single image a reader leaves out."""
+    if count:
+        warnings.warn(
+            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, for want of "
+            "an action that led anywhere",
+            stacklevel=3,
+        )
 
 
 def needs(module: str, what: str) -> Any:

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, both_limits, needs, rescaled
+from wpt_agents.importers.episodes import Episodes, both_limits, needs, rescaled, warn_left_out
 from wpt_agents.trajectory import Trajectory
 
 
 class Hdf5Episodes(Episodes):
-    """The episodes of one file; one with a single observation is left out.
+    """The episodes of one file; one of a single image is left out.
 
     :param image_key: the images' array; the next ones are at `next_` + it
     :param low: (A,) the actions' limits, if they are not in [-1, 1]
@@ -55,7 +55,9 @@ class Hdf5Episodes(Episodes):
         ends = np.flatnonzero(np.logical_or.reduce([np.ravel(f) for f in flags])) + 1
         edges = np.unique(np.concatenate([[0], ends, [rows]])).tolist()
         shortest = 1 if self._next else 2
-        return [(start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+        bounds = [(start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+        warn_left_out(len(edges) - 1 - len(bounds), self._name)
+        return bounds
 
     def __len__(self) -> int:
         return len(self._bounds)

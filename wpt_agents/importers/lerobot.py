@@ -14,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, as_images, both_limits, needs, rescaled
+from wpt_agents.importers.episodes import (
+    Episodes,
+    as_images,
+    both_limits,
+    needs,
+    rescaled,
+    warn_left_out,
+)
 from wpt_agents.trajectory import Trajectory
 
 
@@ -78,7 +85,9 @@ class LeRobotEpisodes(Episodes):
             names = self._parquet.read_schema(file).names
             columns = [name for name in names if name.startswith(wanted)]
             rows += self._parquet.read_table(file, columns=columns).to_pylist()
-        return sorted((r for r in rows if r["length"] > 1), key=lambda r: r["episode_index"])
+        long = [row for row in rows if row["length"] > 1]
+        warn_left_out(len(rows) - len(long), self._folder)
+        return sorted(long, key=lambda row: row["episode_index"])
 
     def __len__(self) -> int:
         return len(self._rows)

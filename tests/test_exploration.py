@@ -1,5 +1,6 @@
 """Curiosity: the losses by hand, surprise where nothing was seen, and agents that go on exactly."""
 
+import copy
 from collections import defaultdict
 from dataclasses import replace
 
@@ -161,14 +162,30 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
     dream = model.policy.dream(Latent(*state), 4, generator())
     ensemble = model.policy.curiosity
     ensemble.scale.see(torch.tensor(1.0))
+    model.arrival = torch.arange(5.0)
     reward = model._imagined_reward(dream)
-    assert reward.shape == (5, 4) and (reward[:, 0] == 0).all() and (reward[:, 1:] > 0).all()
+    assert reward.shape == (5, 4) and (reward[:, 1:] > 0).all()
+    assert reward[:, 0].tolist() == [0, 1, 2, 3, 4]
     step = disagreement(ensemble(dream.states.feat[:, 1], dream.action[:, 1]))
     torch.testing.assert_close(reward[:, 2], step)
     reward.sum().backward()
     assert all(p.grad is None for p in ensemble.parameters())
     assert all(p.grad is None for p in model.policy.world_model.parameters())
     assert all(p.grad.abs().sum() > 0 for p in model.policy.actor.layers[-1].parameters())
+
+
+def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
+    model, batch = explorer(Plan2Explore), batch_of(recorded(8), recorded(8, seed=1))
+    batch.is_first[0, 4] = True  # an episode's edge
+    ensemble = copy.deepcopy(model.policy.curiosity)  # as it is before the update
+    post = model._update_world_model(batch, defaultdict(list), generator())
+    dream = model.policy.dream(post.flatten_time(), 2, generator())
+    paid = model._imagined_reward(dream)[:, 0].view(2, 9)
+    surprise = disagreement(ensemble(post.feat[:, :-1], batch.action[:, 1:]))
+    within = ~batch.is_first[:, 1:]
+    expected = surprise * within / surprise[within].mean()  # the first mean counts in full
+    torch.testing.assert_close(paid[:, 1:], expected)
+    assert (paid[:, 0] == 0).all() and paid[0, 4] == 0 and (paid[0, 5:] > 0).all()
 
 
 @pytest.mark.parametrize("kind", EXPLORERS.values())

@@ -15,6 +15,7 @@ from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import collect as module
 from wpt_agents.zoo.behaviours import COLOURS, coloured_noise, noise_actions
 from wpt_agents.zoo.collect import collect, record
+from wpt_agents.zoo.curious import Expedition, explore
 from wpt_agents.zoo.policies import SavedPolicy, sees_states
 
 gym.register("PlainDot-v0", entry_point="toy_env:DotEnv")
@@ -133,6 +134,46 @@ def test_a_set_aside_episode_is_not_played_again(tmp_path, monkeypatch):
     assert (len(dataset), dataset.appended) == (2, 3)
     monkeypatch.setattr(module, "play", lambda job: pytest.fail("played again"))
     assert len(collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False)) == 2
+
+
+def killed(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("where", ["wpt_agents.index", "wpt_agents.zoo.collect"])
+def test_a_collection_killed_while_its_folder_is_made_goes_on(tmp_path, monkeypatch, where):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f"{where}.replacing", killed)  # no meta.json yet, or no collect.json yet
+        collect(tmp_path / "half", [DOT], 1, workers=1, progress_bar=False)
+    assert (tmp_path / "half" / "index.jsonl").exists()
+    half = collect(tmp_path / "half", [DOT], 1, workers=1, progress_bar=False)
+    assert same(half, collect(tmp_path / "whole", [DOT], 1, workers=1, progress_bar=False))
+
+
+def test_a_label_killed_halfway_is_not_there(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("wpt_agents.archive.os.fsync", killed)
+        module._open(created(tmp_path / "half"), {"tasks": [DOT]})
+    assert not (tmp_path / "half" / "collect.json").exists()
+    assert len(module._open(tmp_path / "half", {"tasks": [DOT]})) == 0
+
+
+def created(path):
+    return TrajectoryDataset.create(path).path
+
+
+def test_a_damaged_label_is_named(tmp_path):
+    collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
+    (tmp_path / "data" / "collect.json").write_text('{"tasks": [')
+    with pytest.raises(ValueError, match=r"collect\.json is damaged .*another path"):
+        collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
+
+
+def test_a_folder_of_something_else_is_not_collected_into(tmp_path):
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(ValueError, match="is not empty"):
+        collect(tmp_path, [DOT], 1, workers=1, progress_bar=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_a_folder_with_other_settings_is_refused(tmp_path):
@@ -284,6 +325,13 @@ def test_a_curious_agent_that_was_stopped_goes_on_to_the_same_data(
     assert len(TrajectoryDataset.open(tmp_path)) == 3 * ((stop_at - 1) // 3)
     monkeypatch.setattr(Plan2Explore, "save", save)
     assert same(explored, curious(tmp_path))
+
+
+def test_a_curious_agent_killed_while_its_folder_is_made_goes_on(tmp_path):
+    trip = Expedition(DOT, 1, 1, "plan2explore", tmp_path, lambda: gym.make(DOT), QUICK)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "index.jsonl").touch()  # and no meta.json
+    assert list(explore(trip)) == [1]
 
 
 # The paper's split

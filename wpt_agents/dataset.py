@@ -107,6 +107,19 @@ class TrajectoryDataset(Conversions):
         return cls(path, meta, undamaged(path, read_index(path)[0]), workers=workers)
 
     @classmethod
+    def open_or_create(
+        cls, path: str | os.PathLike[str], image_size: int = IMAGE_SIZE
+    ) -> "TrajectoryDataset":
+        """The dataset at `path` to go on with, or an empty one where none is yet.
+
+        A `create` that was killed halfway is repeated.
+
+        :raises ValueError: as `open` and `create`
+        """
+        there = (Path(path) / "meta.json").exists()
+        return cls.open(path) if there else cls.create(path, image_size)
+
+    @classmethod
     def merge(
         cls,
         path: str | os.PathLike[str],

@@ -220,7 +220,14 @@ class ICMExplorer(Explorer):
 
 
 class Plan2Explore(Explorer):
-    """The reward of an imagined step is how much an ensemble disagrees on what comes next."""
+    """The reward of a step is how much an ensemble disagrees on where it leads.
+
+    It is paid on arriving, as the world model's rewards are: in imagination at the states 1 .. H-1,
+    and at the replayed state 0 for the real step that led there, so that the critic's value means
+    the same everywhere. Nothing led to the first state of a replayed window, which is paid 0.
+    """
+
+    arrival: Tensor  # (B*T,), of the replayed states that the next dream starts from
 
     def _make_curiosity(self) -> Ensemble:
         outputs = self.policy.world_model.encoder.embed_dim
@@ -241,17 +248,19 @@ class Plan2Explore(Explorer):
             prediction = ensemble(post.feat[:, :-1], batch.action[:, 1:])
             loss = ensemble_loss(prediction, embed, within)
         self._descend(self.curiosity_optimizer, loss, "curiosity")
-        surprise = disagreement(prediction.detach())[within]
-        ensemble.scale.see(surprise)
-        metrics["explore/surprise"].append(surprise.mean())
+        surprise = disagreement(prediction.detach())
+        ensemble.scale.see(surprise[within])
+        metrics["explore/surprise"].append(surprise[within].mean())
+        paid = ensemble.scale(surprise) * within
+        self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
         return post
 
     def _imagined_reward(self, dream: Dream) -> Tensor:
         ensemble, feat = self.policy.curiosity, dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        # what step t causes is paid on arriving at t + 1; nothing imagined led to state 0
-        return torch.cat([torch.zeros_like(surprise[:, :1]), surprise], 1)
+        assert len(self.arrival) == len(surprise), (self.arrival.shape, surprise.shape)
+        return torch.cat([self.arrival[:, None], surprise], 1)
 
 
 EXPLORERS: dict[str, type[Explorer]] = {"icm": ICMExplorer, "plan2explore": Plan2Explore}

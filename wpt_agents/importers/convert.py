@@ -94,9 +94,8 @@ class Conversions:
         """
         from tqdm.auto import tqdm
 
-        store: Any = cls  # `create`, `open` and `append` are TrajectoryDataset's
-        there = Path(path).exists() and any(Path(path).iterdir())
-        dataset = store.open(path) if there else store.create(path, episodes.image_size)
+        store: Any = cls  # `open_or_create` and `append` are TrajectoryDataset's
+        dataset = store.open_or_create(path, episodes.image_size)
         done = dataset.appended
         known = done > 0 and len(dataset) == done  # else the last one may be set aside
         if done > len(episodes) or (known and _label(dataset[-1]) != _label(episodes[done - 1])):

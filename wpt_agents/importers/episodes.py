@@ -1,5 +1,6 @@
 """What every reader of a foreign format shares: its options, image and action conversion."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from importlib import import_module
@@ -14,6 +15,8 @@ from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
 
 class Episodes(ABC):
     """Somebody's episodes in a fixed order, each read and converted when asked for.
+
+    One of a single image holds no action and is left out, aloud.
 
     :param image_size: height and width to resize to
     :param rewards: whether to keep the rewards; pre-training needs none
@@ -66,6 +69,16 @@ class Episodes(ABC):
             raise ValueError(f"{source}: {error}") from error
 
 
+def warn_left_out(count: int, source: object) -> None:
+    """Says how many episodes of a single image a reader leaves out."""
+    if count:
+        warnings.warn(
+            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, for want of "
+            "an action that led anywhere",
+            stacklevel=3,
+        )
+
+
 def needs(module: str, what: str) -> Any:
     """Imports an optional package, or says how to get it."""
     try:
@@ -100,6 +113,20 @@ def _resized(image: np.ndarray, size: int) -> np.ndarray:
     pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).float()
     pixels = F.interpolate(pixels, (size, size), mode="bilinear", antialias=True)
     return pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
+
+
+def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """The actions' limits as arrays, None where neither is given.
+
+    :raises ValueError: one without the other
+    """
+    if low is None and high is None:
+        return None
+    if low is None or high is None:
+        raise ValueError(
+            f"low and high, the actions' limits, belong together; got low={low} and high={high}"
+        )
+    return np.asarray(low, np.float64), np.asarray(high, np.float64)
 
 
 def rescaled(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, needs, rescaled
+from wpt_agents.importers.episodes import Episodes, both_limits, needs, rescaled, warn_left_out
 from wpt_agents.trajectory import Trajectory
 
 
 class Hdf5Episodes(Episodes):
-    """The episodes of one file; one with a single observation is left out.
+    """The episodes of one file; one of a single image is left out.
 
     :param image_key: the images' array; the next ones are at `next_` + it
     :param low: (A,) the actions' limits, if they are not in [-1, 1]
@@ -32,12 +32,13 @@ class Hdf5Episodes(Episodes):
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        self._limits = both_limits(low, high)
         h5py = needs("h5py", "HDF5 files")
         try:
             self._file = h5py.File(file, "r")
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
-        self._name, self._key, self._limits = os.fspath(file), image_key, (low, high)
+        self._name, self._key = os.fspath(file), image_key
         missing = {image_key, "actions"} - set(self._file)
         if missing or not {"terminals", "timeouts"} & set(self._file):
             raise ValueError(
@@ -54,7 +55,9 @@ class Hdf5Episodes(Episodes):
         ends = np.flatnonzero(np.logical_or.reduce([np.ravel(f) for f in flags])) + 1
         edges = np.unique(np.concatenate([[0], ends, [rows]])).tolist()
         shortest = 1 if self._next else 2
-        return [(start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+        bounds = [(start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+        warn_left_out(len(edges) - 1 - len(bounds), self._name)
+        return bounds
 
     def __len__(self) -> int:
         return len(self._bounds)
@@ -69,8 +72,7 @@ class Hdf5Episodes(Episodes):
             terminated = "terminals" in self._file and bool(self._file["terminals"][stop - 1])
         else:
             action, reward = action[:-1], None if reward is None else reward[:-1]
-        low, high = self._limits
-        if low is not None and high is not None:
-            action = rescaled(action, low, high)
+        if self._limits:
+            action = rescaled(action, *self._limits)
         source = f"{os.path.basename(self._name)} rows {start} to {stop - 1}"
         return self._trajectory(image, action, reward, source, terminated=terminated)

@@ -14,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, as_images, needs, rescaled
+from wpt_agents.importers.episodes import (
+    Episodes,
+    as_images,
+    both_limits,
+    needs,
+    rescaled,
+    warn_left_out,
+)
 from wpt_agents.trajectory import Trajectory
 
 
@@ -36,6 +43,7 @@ class LeRobotEpisodes(Episodes):
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        given = both_limits(low, high)
         self._parquet = needs("pyarrow.parquet", "LeRobot datasets")
         self._folder = Path(folder)
         self._info = json.loads(_text(self._folder / "meta" / "info.json"))
@@ -43,7 +51,7 @@ class LeRobotEpisodes(Episodes):
         if not version.startswith("v3."):
             raise ValueError(f"{folder} is of version {version}; convert it to v3.0 with lerobot")
         self._camera = self._choose(camera)
-        self._low, self._high = self._limits(low, high)
+        self._low, self._high = given or self._limits()
         self._rows = self._episodes()
         self._open: tuple[Path, Any] | None = None
         if self._info["features"][self._camera]["dtype"] == "video":
@@ -64,13 +72,10 @@ class LeRobotEpisodes(Episodes):
             )
         return chosen[0]
 
-    def _limits(
-        self, low: Sequence[float] | None, high: Sequence[float] | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        if low is None or high is None:
-            stats = json.loads(_text(self._folder / "meta" / "stats.json"))["action"]
-            low, high = stats["min"], stats["max"]
-        return np.asarray(low, np.float64), np.asarray(high, np.float64)
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and greatest actions in the data."""
+        stats = json.loads(_text(self._folder / "meta" / "stats.json"))["action"]
+        return np.asarray(stats["min"], np.float64), np.asarray(stats["max"], np.float64)
 
     def _episodes(self) -> list[dict[str, Any]]:
         files = sorted((self._folder / "meta" / "episodes").rglob("*.parquet"))
@@ -80,7 +85,9 @@ class LeRobotEpisodes(Episodes):
             names = self._parquet.read_schema(file).names
             columns = [name for name in names if name.startswith(wanted)]
             rows += self._parquet.read_table(file, columns=columns).to_pylist()
-        return sorted((r for r in rows if r["length"] > 1), key=lambda r: r["episode_index"])
+        long = [row for row in rows if row["length"] > 1]
+        warn_left_out(len(rows) - len(long), self._folder)
+        return sorted(long, key=lambda row: row["episode_index"])
 
     def __len__(self) -> int:
         return len(self._rows)

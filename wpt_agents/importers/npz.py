@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes
+from wpt_agents.importers.episodes import Episodes, warn_left_out
 from wpt_agents.trajectory import Trajectory
 
 IMAGE_KEYS = ("observation", "image", "pixels")
@@ -31,9 +31,20 @@ class NpzEpisodes(Episodes):
     ) -> None:
         super().__init__(**options)
         self._folder, self._keys = Path(folder), (image_key,) if image_key else IMAGE_KEYS
-        self._files = sorted(self._folder.rglob("*.npz"))
-        if not self._files:
+        files = sorted(self._folder.rglob("*.npz"))
+        if not files:
             raise ValueError(f"{folder} holds no .npz file")
+        self._files = [file for file in files if not self._is_single(file)]
+        warn_left_out(len(files) - len(self._files), folder)
+
+    def _is_single(self, file: Path) -> bool:
+        """Whether an episode has one image; what is damaged or strange is named when it is read."""
+        try:
+            if len(_arrays(file, {"action"}).get("action", ())) != 1:
+                return False
+            return {len(images) for images in _arrays(file, set(self._keys)).values()} == {1}
+        except (ValueError, TypeError):  # TypeError: a number in place of an array
+            return False
 
     def __len__(self) -> int:
         return len(self._files)

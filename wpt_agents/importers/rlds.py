@@ -13,12 +13,20 @@ import os
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, as_images, needs, rescaled
+from wpt_agents.importers.episodes import (
+    Episodes,
+    as_images,
+    both_limits,
+    needs,
+    rescaled,
+    warn_left_out,
+)
 from wpt_agents.trajectory import Trajectory
 
 JPEG = b"\xff\xd8"
@@ -46,16 +54,19 @@ class RldsEpisodes(Episodes):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self._key, self._action, self._limits = image_key, action_key, (low, high)
+        self._key, self._action = image_key, action_key
+        self._limits = both_limits(low, high)
         self._folder = Path(folder)
         pattern = f"*-{split}.tfrecord*" if split else "*.tfrecord*"
-        self._records = [
-            (file, at, size)
+        records = [
+            (file, at, size, single)
             for file in sorted(self._folder.rglob(pattern))
-            for at, size in _records(file)
+            for at, size, single in _records(file)
         ]
-        if not self._records:
+        if not records:
             raise ValueError(f"{folder} holds no episode in files named {pattern}")
+        self._records = [record[:3] for record in records if not record[3]]
+        warn_left_out(len(records) - len(self._records), folder)
         self._warned = False
 
     def __len__(self) -> int:
@@ -70,9 +81,8 @@ class RldsEpisodes(Episodes):
         image = self._images(steps, source)
         action = self._find(steps, self._action, source)
         action = np.asarray(action, np.float32).reshape(len(image), -1)[:-1]
-        low, high = self._limits
-        if low is not None and high is not None:
-            action = rescaled(action, np.asarray(low), np.asarray(high))
+        if self._limits:
+            action = rescaled(action, *self._limits)
         reward = steps.get("reward")
         return self._trajectory(
             image,
@@ -89,7 +99,9 @@ class RldsEpisodes(Episodes):
 
     def _images(self, steps: dict[str, Any], source: str) -> np.ndarray:
         """The episode's images, each resized as soon as it is decoded."""
-        pictures = [k for k, v in steps.items() if isinstance(v, list) and v and _is_picture(v[0])]
+        pictures = sorted(
+            k for k, v in steps.items() if isinstance(v, list) and v and _is_picture(v[0])
+        )
         key = self._key if self._key is None or "/" in self._key else f"observation/{self._key}"
         if key is None and len(pictures) != 1:
             raise ValueError(
@@ -97,6 +109,11 @@ class RldsEpisodes(Episodes):
                 f"{', '.join(pictures) or 'none, it has no images'}"
             )
         encoded = self._find(steps, key or pictures[0], source)
+        if key is not None and key not in pictures:
+            raise ValueError(
+                f"{source} has no images under {key!r}; give image_key, one of: "
+                f"{', '.join(pictures) or 'none, it has no images'}"
+            )
         if encoded[0].startswith(JPEG) and not self._warned:
             self._warned = True
             warnings.warn(f"The images of {self._folder} are JPEG, which is lossy", stacklevel=4)
@@ -114,30 +131,49 @@ def _is_picture(data: bytes) -> bool:
     return data.startswith((JPEG, b"\x89PNG"))
 
 
-def _records(file: Path) -> Iterator[tuple[int, int]]:
-    """Yields where each record's data begin and how long they are, from the lengths alone."""
+def _records(file: Path) -> Iterator[tuple[int, int, bool]]:
+    """Yields where each record's data begin, how long they are, and whether it is `_is_single`."""
     end, at = file.stat().st_size, 0
+    if not end:
+        return
     with open(file, "rb") as opened:
-        while at < end:
-            opened.seek(at)
-            head = opened.read(12)
-            size = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else end
-            if at + 16 + size > end:
-                raise ValueError(f"{file} is cut short: a record at byte {at} goes past its end")
-            yield at + 12, size
-            at += 16 + size
+        data = memoryview(mmap(opened.fileno(), 0, access=ACCESS_READ))
+    while at < end:
+        head = data[at : at + 12]
+        size = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else end
+        if at + 16 + size > end:
+            raise ValueError(f"{file} is cut short: a record at byte {at} goes past its end")
+        yield at + 12, size, _is_single(data[at + 12 : at + 12 + size])
+        at += 16 + size
+
+
+def _is_single(data: memoryview) -> bool:
+    """Whether an episode has one step; its images are skipped, and damage is found later."""
+    try:
+        for name, feature in _features(data):
+            if name == "steps/is_first":
+                return [len(_values(*each)) for each in _fields(feature)] == [1]
+    except (KeyError, IndexError, TypeError, ValueError):
+        pass
+    return False
+
+
+def _features(data: memoryview) -> Iterator[tuple[str, memoryview]]:
+    """The names and values of a tf.train.Example."""
+    for _, features in _fields(data):
+        for _, entry in _fields(features):
+            pair = dict(_fields(entry))
+            if 2 in pair:
+                yield bytes(pair[1]).decode(), pair[2]
 
 
 def _steps(data: bytes, source: str) -> dict[str, Any]:
     """The lists of an episode's steps by name: bytes in a list, numbers in an array."""
     steps: dict[str, Any] = {}
     try:
-        for _, features in _fields(memoryview(data)):
-            for _, entry in _fields(features):
-                pair = dict(_fields(entry))
-                name = bytes(pair[1]).decode()
-                if name.startswith("steps/") and 2 in pair:
-                    steps |= {name[6:]: _values(*each) for each in _fields(pair[2])}
+        for name, feature in _features(memoryview(data)):
+            if name.startswith("steps/"):
+                steps |= {name[6:]: _values(*each) for each in _fields(feature)}
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f"{source} is damaged or no tf.train.Example: {error}") from error
     if not steps:

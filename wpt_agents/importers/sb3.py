@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl
 
-from wpt_agents.importers.episodes import Episodes
+from wpt_agents.importers.episodes import Episodes, warn_left_out
 from wpt_agents.trajectory import Trajectory
 
 
@@ -53,7 +53,9 @@ class SB3Episodes(Episodes):
         ends = np.flatnonzero(self._buffer.dones[self._rows, env]) + 1
         edges = np.unique(np.concatenate([[0], ends, [len(self._rows)]])).tolist()
         shortest = 2 if self._overwritten else 1
-        return [(env, start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
+        bounds = [(env, a, b) for a, b in pairwise(edges) if b - a >= shortest]
+        warn_left_out(len(edges) - 1 - len(bounds), f"SB3 replay buffer, environment {env}")
+        return bounds
 
     def __len__(self) -> int:
         return len(self._bounds)

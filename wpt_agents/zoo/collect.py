@@ -26,6 +26,7 @@ import wpt_envs
 from gymnasium import spaces
 from tqdm.auto import tqdm
 
+from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.exploration import EXPLORERS
 from wpt_agents.names import unknown_name
@@ -283,11 +284,11 @@ def _has_script(task: str) -> bool:
 def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     """The dataset to append to: a new one, or the one that the same call began."""
     label = path / "collect.json"
-    begun = path.exists() and any(path.iterdir())
-    dataset = TrajectoryDataset.open(path) if begun else TrajectoryDataset.create(path)
+    dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
-        label.write_text(json.dumps(told, indent=1))
-    found = json.loads(label.read_text()) if label.exists() else {}
+        with replacing(label) as temporary:
+            temporary.write_text(json.dumps(told, indent=1))
+    found = _read_label(label) if label.exists() else {}
     differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]
     if differ:
         raise ValueError(
@@ -295,6 +296,15 @@ def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
             "give another path, or delete it"
         )
     return dataset
+
+
+def _read_label(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(
+            f"{file} is damaged ({error}); restore the file, or give another path"
+        ) from error
 
 
 def _played(jobs: Sequence[Job], workers: int) -> Iterator[list[Trajectory]]:

@@ -54,8 +54,7 @@ def _one_thread() -> Iterator[None]:
 def explore(trip: Expedition) -> Iterator[int]:
     """Plays what is missing of an expedition; yields each episode's number when it is stored."""
     trip.folder.mkdir(parents=True, exist_ok=True)
-    path = trip.folder / "data"
-    store = TrajectoryDataset.open(path) if path.exists() else TrajectoryDataset.create(path)
+    store = TrajectoryDataset.open_or_create(trip.folder / "data")
     if len(store) == trip.episodes:
         return
     with _one_thread(), store, closing(trip.make()) as env:

@@ -185,15 +185,11 @@ def large_store(path: Path, count: int, copies: int, workers: Sequence[int]) -> 
 
 def make_store(path: Path, count: int, copies: int) -> None:
     """The same `count` trajectories `copies` times; what is there of them already is kept."""
-    with _begun(path.with_name(f"{path.name}-base")) as base:
+    with TrajectoryDataset.open_or_create(path.with_name(f"{path.name}-base")) as base:
         base.extend(synthetic(count, STEPS)[len(base) :])
-    with _begun(path) as dataset:
+    with TrajectoryDataset.open_or_create(path) as dataset:
         while len(dataset) < count * copies:
             dataset.extend(base.subset(range(len(dataset) % count, count)))
-
-
-def _begun(path: Path) -> TrajectoryDataset:
-    return TrajectoryDataset.open(path) if path.exists() else TrajectoryDataset.create(path)
 
 
 def use_store(path: Path, workers: int, draws: int = 50) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from rich.console import Console
 from stable_baselines3.common.results_plotter import load_results, plot_results, ts2xy
 from test_zoo import call, dot, job  # noqa: F401  (dot registers the task for each test)
 
-from wpt_agents.zoo.benchmark import locked, run
+from wpt_agents.zoo.benchmark import run
+from wpt_agents.zoo.stages import locked
 from wpt_agents.zoo.watch import clock, overview, read_monitor, speed, standing
 
 HEAD = '#{"t_start": 1.0}\nr,l,t\n'
@@ -26,7 +27,7 @@ def one(tmp_path):
 def test_a_run_goes_from_waiting_to_finished(tmp_path, one):
     assert standing(job(tmp_path, seed=9)).state == "waiting"
     assert standing(one).state == "stopped"
-    with locked(one.folder):
+    with locked(one.folder / "lock"):
         assert standing(one).state == "preparing"
         (one.folder / "0.monitor.csv").write_text(HEAD + "3.0,25,10.0\n5.0,25,20.0\n")
         now = standing(one)
@@ -57,7 +58,7 @@ def test_speed_counts_since_the_process_began_again():
 
 def test_each_run_has_a_line_with_progress_return_speed_and_time_left(one, capsys):
     (one.folder / "0.monitor.csv").write_text(HEAD + "3.0,25,10.0\n5.0,25,20.0\n")
-    with locked(one.folder):
+    with locked(one.folder / "lock"):
         Console(width=140).print(overview([one]))
     line = next(line for line in capsys.readouterr().out.splitlines() if "dmc-dot" in line)
     cells = [cell.strip() for cell in line.strip("│ ").split("│")]

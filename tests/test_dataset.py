@@ -160,7 +160,9 @@ def test_extending_copies_another_dataset_in_its_order(tmp_path, codec):
 
 def test_merge_makes_a_dataset_of_several(tmp_path):
     parts = [made(tmp_path / str(n), chain(n), chain(n + 1)) for n in (3, 5)]
-    merged = TrajectoryDataset.merge(tmp_path / "all", [*parts, parts[0].subset([1])])
+    merged = TrajectoryDataset.merge(
+        tmp_path / "all", [str(parts[0].path), parts[1], parts[0].subset([1])]
+    )
     assert merged.lengths.tolist() == [3, 4, 5, 6, 4]
     assert merged.validate() == []
     with merged:

@@ -13,6 +13,7 @@ from wpt_agents import updates, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.wpt import WPT
+from wpt_agents.zoo.plan import make_plan
 
 
 def finite(model):
@@ -269,3 +270,30 @@ def test_damaged_weights_do_not_act():
 
 def test_the_debug_settings_are_all_keywords_of_the_constructor():
     assert set(SETTINGS) <= wpt.KEYWORDS
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("gamma", 1.5, r"gamma is a share in \[0, 1\], got 1.5"),
+        ("gamma", "high", "gamma is a share"),
+        ("batch_size", 0, "batch_size is a whole number from 1 on, got 0"),
+        ("imagine_horizon", 2.5, "imagine_horizon is a whole number"),
+        ("train_ratio", -1, "train_ratio is a number from 0 on, got -1"),
+        ("learning_rate", float("nan"), "learning_rate is a number from 0 on"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        agent(**{name: value})
+
+
+def test_a_plan_with_such_a_value_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(ValueError, match="gamma is a share"):
+        make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], ["gamma=high"], tmp_path, 1, "cpu")
+
+
+@pytest.mark.parametrize("task", ["metaworld-drawer-close", "drawer-close"])
+def test_a_task_of_another_suite_is_told_its_suite(tmp_path, task):
+    with pytest.raises(ValueError, match="of the suite metaworld: --suite metaworld"):
+        make_plan("dmc", [task], "debug", "1", ["wpt"], [], tmp_path, 1, "cpu")

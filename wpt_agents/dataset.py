@@ -123,16 +123,17 @@ class TrajectoryDataset(Conversions):
     def merge(
         cls,
         path: str | os.PathLike[str],
-        datasets: Sequence["TrajectoryDataset"],
+        datasets: Sequence["TrajectoryDataset | str | os.PathLike[str]"],
         workers: int = 0,
     ) -> "TrajectoryDataset":
-        """Makes a new dataset of all trajectories of `datasets`, in their order.
+        """Makes a new dataset at `path` of all trajectories of `datasets`, in their order.
 
         Its codec is theirs, or "zstd" if they differ, so that nothing more is lost.
 
         :raises ValueError: no datasets, images of different sizes, a folder with something in it,
             or a damaged trajectory; those before it are kept
         """
+        datasets = [d if isinstance(d, TrajectoryDataset) else cls.open(d) for d in datasets]
         metas = {dataset._meta: dataset.path for dataset in datasets}
         if len({meta.image_size for meta in metas}) != 1:
             found = ", ".join(f"{path} has {meta.image_size}" for meta, path in metas.items())

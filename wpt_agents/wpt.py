@@ -33,7 +33,7 @@ from torch.optim import AdamW
 from tqdm.auto import tqdm
 
 from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
-from wpt_agents.checks import check_dataset, check_rewards, check_spaces
+from wpt_agents.checks import check_dataset, check_hyperparameters, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.importers.convert import Data
@@ -158,8 +158,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         for name, valid in CHOICES.items():
             if given[name] not in valid:
                 raise unknown_name(name, given[name], valid)
-        if not 0 <= offline_ratio <= 1:
-            raise ValueError(f"offline_ratio is a share in [0, 1], got {offline_ratio}")
+        check_hyperparameters(given)
         for name, value in given.items():
             setattr(self, name, value)
         super().__init__(

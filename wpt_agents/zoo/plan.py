@@ -12,6 +12,7 @@ import numpy as np
 from rich.table import Table
 from wpt_envs.tasks import Task
 
+from wpt_agents.checks import check_hyperparameters
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.names import unknown_name
 from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
@@ -162,6 +163,10 @@ def make_plan(
 ) -> list[Run]:
     """One run for each task, method and seed; every name and setting is valid, or ValueError."""
     rows, resolved = find_tasks(suite, tasks), load_preset(suite, preset, settings)
+    for row in rows:
+        if row.suite != suite:
+            raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
+    check_hyperparameters({**wpt_keywords(), **resolved.wpt})
     find_tasks(suite, resolved.collect.tasks)
     if data is not None:
         TrajectoryDataset.open(data)

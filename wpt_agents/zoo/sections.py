@@ -53,6 +53,7 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 for t in tasks.values()
                 if {("wpt", "WPT"), other} <= t.keys()
             ]
+            pairs = [pair for pair in pairs if all(row.t_low is not None for row in pair)]
             if pairs:
                 above = sum(report.above(ours, theirs) for ours, theirs in pairs)
                 below = sum(report.above(theirs, ours) for ours, theirs in pairs)

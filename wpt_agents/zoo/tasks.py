@@ -26,6 +26,11 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
         name = name.removeprefix(f"{where}-")
         rows = {row.name: row for row in table.suite(where, paper_only=False)}
         matching = {row.id: row for n, row in rows.items() if fnmatchcase(n, name)}
+        elsewhere = [
+            s for s in suites if any(t.name == name for t in table.suite(s, paper_only=False))
+        ]
+        if not matching and elsewhere:
+            raise ValueError(f"{name} is of the suite {elsewhere[0]}: --suite {elsewhere[0]}")
         if not matching:
             raise unknown_name(f"task in suite {where!r} called", name, rows)
         found |= matching

@@ -2,12 +2,13 @@ import json
 
 import pytest
 import torch
+from rich.console import Console, ConsoleDimensions
 from torch import nn
 from typer.testing import CliRunner
 
 from wpt_agents.networks import FromPixel, UpConv
 from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.bench import policy, profile, replay, timing
+from wpt_agents.zoo.bench import command, policy, profile, replay, timing
 
 KEYS = {
     *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
@@ -66,3 +67,13 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
     assert isinstance(ran.exception, ValueError) and "h5py" in str(ran.exception)
     ran = CliRunner().invoke(app, ["bench", "--quick"])
     assert ran.exit_code == 0 and "bench data left out: it needs h5py" in ran.stderr
+
+
+def test_a_table_shortens_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(Console, "size", ConsoleDimensions(60, 25))
+    task = "metaworld-button-press-topdown-wall"
+    command._print_table("envs", [{"what": "step", "task": task, "a_long_heading_of_a_column": 1}])
+    told = capsys.readouterr().out
+    joined = "".join(c for c in told if c.isalnum() or c in "-_")
+    assert max(map(len, told.splitlines())) <= 60 and "…" not in told
+    assert all(part in joined for part in ("button-press", "wall", "heading"))

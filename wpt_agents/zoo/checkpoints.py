@@ -61,9 +61,8 @@ class Checkpoint:
         window = model._stats_window_size
         model.ep_info_buffer = deque(self.state["ep_info"], maxlen=window)
         model.ep_success_buffer = deque(self.state["ep_success"], maxlen=window)
-        for name, (value, count) in self.state["log"].items():
+        for name, value in self.state["log"].items():
             model.logger.record_mean(name, value)
-            model.logger.name_to_count[name] = count
 
 
 def write_checkpoint(model: WPT, run: Path, seconds: float = 0.0) -> None:
@@ -85,11 +84,11 @@ def write_checkpoint(model: WPT, run: Path, seconds: float = 0.0) -> None:
     for name in LOGS:
         if (run / name).exists():
             shutil.copy2(run / name, aside / name)
-    values, counts = model.logger.name_to_value, model.logger.name_to_count
+    log = model.logger  # after an episode's updates each of its means has been recorded once
     state = {
         "seconds": seconds,
         "replay": len(replay),
-        "log": {k: (float(v), counts[k]) for k, v in values.items() if counts[k]},
+        "log": {k: float(v) for k, v in log.name_to_value.items() if log.name_to_count[k]},
         "ep_info": list(model.ep_info_buffer or []),
         "ep_success": [bool(s) for s in model.ep_success_buffer or []],
         "files": {path.name: _checksum(path) for path in sorted(aside.iterdir())},

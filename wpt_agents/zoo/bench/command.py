@@ -57,14 +57,17 @@ def _rows(name: str, options: dict[str, Any]) -> Iterator[dict]:
 
 
 def _print_table(title: str, found: list[dict]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
+    from wpt_agents.zoo.stages import console
+
     columns = list(dict.fromkeys(key for row in found for key in row))
-    table = Table(*columns, title=title)
+    table = Table(title=title)
+    for name in columns:
+        table.add_column(name, overflow="fold")
     for row in found:
         table.add_row(*(_cell(row.get(key, "")) for key in columns))
-    Console().print(table)
+    console.print(table)
 
 
 def _cell(value: Any) -> str:

@@ -41,6 +41,7 @@ METHODS = {
     "no-guidance": Method(wpt={"guidance": 0.0}),
     "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
+    "random-retrieval": Method(wpt={"retrieval": "random"}),
 }
 ABLATION = {
     "scratch": "none",

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from run_folders import make_run
 
-from wpt_agents.zoo import aggregates, figures
-from wpt_agents.zoo.aggregates import misprint, references
-from wpt_agents.zoo.page import write_page
+from wpt_agents.zoo.report import aggregates, figures
+from wpt_agents.zoo.report.aggregates import misprint, references
+from wpt_agents.zoo.report.page import write_page
 
 
 @pytest.fixture

@@ -1,18 +1,16 @@
-"""Run folders -> tables: one run's policies, and many runs' means over seeds."""
+"""Results -> tables: one run's policies, and many runs' means over seeds."""
 
 import csv
 import io
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from rich.table import Table
 
-from wpt_agents.zoo.aggregates import references, score_of
+from wpt_agents.zoo.report.aggregates import references, score_of
 from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval
 
 POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
@@ -35,36 +33,6 @@ class Row:
     low: float | None
     high: float | None
     paper: float | None
-
-
-def read_runs(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """Every finished run below `folder` and its result, in the order of their paths.
-
-    :raises ValueError: a run that stands there twice, which would count as two seeds
-    """
-    runs = [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
-    seen: dict[tuple[Any, ...], Path] = {}
-    for path, result in runs:
-        one = tuple(result[name] for name in ("task", "method", "preset", "frames", "seed"))
-        if one in seen:
-            raise ValueError(
-                f"{seen[one]} and {path} are the same run: report one of their folders, or delete "
-                "one of them"
-            )
-        seen[one] = path
-    return runs
-
-
-def read_results(folder: Path) -> list[dict[str, Any]]:
-    """The results of `read_runs`."""
-    return [result for _, result in read_runs(folder)]
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); delete it and run again") from None
 
 
 def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:

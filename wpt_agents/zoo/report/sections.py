@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.zoo import aggregates, figures, report
-from wpt_agents.zoo.aggregates import STATISTICS, Estimate, Experiment, Reference
-from wpt_agents.zoo.folders import Finished
 from wpt_agents.zoo.plan import ABLATION
-from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile
+from wpt_agents.zoo.report import aggregates, figures
+from wpt_agents.zoo.report.aggregates import STATISTICS, Estimate, Experiment, Reference
+from wpt_agents.zoo.report.folders import Finished
+from wpt_agents.zoo.report.tables import above, interval_text, policies
+from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval, performance_profile
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
 TITLES = {3: "Meta-World", 4: "Meta-World, continued", 5: "DMControl"}
@@ -39,7 +40,7 @@ class Names:
 def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """For each suite and budget: on how many tasks WPT's interval lies above another policy's."""
     tables: dict[tuple[str, str, int], dict[str, dict[tuple[str, str], Any]]] = {}
-    for row in report.policies(results):
+    for row in policies(results):
         about = row.task.split("-")[0], row.preset, row.frames
         tables.setdefault(about, {}).setdefault(row.task, {})[row.method, row.policy] = row
     others = {"random policy": ("", "random"), "prior actor": ("wpt", "prior actor")}
@@ -55,9 +56,9 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             ]
             pairs = [pair for pair in pairs if all(row.t_low is not None for row in pair)]
             if pairs:
-                above = sum(report.above(ours, theirs) for ours, theirs in pairs)
-                below = sum(report.above(theirs, ours) for ours, theirs in pairs)
-                against.append({"name": name, "above": above, "below": below, "of": len(pairs)})
+                higher = sum(above(ours, theirs) for ours, theirs in pairs)
+                lower = sum(above(theirs, ours) for ours, theirs in pairs)
+                against.append({"name": name, "above": higher, "below": lower, "of": len(pairs)})
         if against:
             told.append(
                 {"suite": SUITES[suite], "preset": preset, "frames": frames, "against": against}
@@ -278,13 +279,13 @@ def our_cell(runs: Sequence[Finished]) -> dict[str, Any] | None:
     if not runs:
         return None
     scores = [aggregates.score_of(run.result) for run in runs]
-    middle, low, high = report.mean_interval(scores)
+    middle, low, high = mean_interval(scores)
     if runs[0].result["metric"] == "success" and low is not None and high is not None:
         low, high = max(low, 0.0), min(high, 1.0)
     return {
         "run": runs[0].name,
         "mean": middle,
-        "interval": report.interval_text(low, high) if low is not None else "",
+        "interval": interval_text(low, high) if low is not None else "",
         "seeds": [run.result["seed"] for run in runs],
         "frames": runs[0].result["frames"],
         "commits": sorted({run.result.get("commit") or "unknown" for run in runs}),

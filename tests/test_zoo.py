@@ -73,7 +73,7 @@ def test_a_run_leaves_everything_in_one_folder(tmp_path):
     result = run(one)
     names = {path.name for path in one.folder.iterdir()}
     logs = {"0.monitor.csv", "progress.csv", "evaluations.npz", "system.json", "command.txt"}
-    pictures = {"learning_curve.png", "policy.mp4", "predictions.png"}
+    pictures = {"learning_curve.png", "policy.mp4", "predictions.png", "retrieval.png"}
     assert logs | pictures | {"config.yaml", "model.zip", "result.json"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
     assert list(result["scores"]) == ["nothing", "random", "prior actor", "WPT"]
@@ -97,6 +97,8 @@ def test_every_method_runs(tmp_path, method):
     guided = method not in ("scratch", "pretrain-only", "no-guidance")
     assert ("prior actor" in result["scores"]) == guided
     assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
+    retrieved = (job(tmp_path, method).folder / "retrieval.png").exists()
+    assert retrieved == (method not in ("scratch", "pretrain-only"))
 
 
 def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):

@@ -89,7 +89,7 @@ def test_a_search_leaves_the_query_out_and_keeps_to_its_robot_if_told_to(dataset
 
 
 def test_a_task_is_searched_for_by_its_first_image():
-    query = sheets.query_at(find("metaworld", "reach"), "fast")
+    query = sheets.query_at(find("metaworld", "reach"), {"rendering": "fast"})
     env = gym.make("wpt/metaworld-reach-v0", rendering="fast")
     np.testing.assert_array_equal(query.image, env.reset(seed=0)[0])
     assert (query.embodiment, query.action_dim) == ("sawyer", 4)

@@ -5,6 +5,7 @@ import pytest
 from run_folders import make_run
 
 from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report.aggregates import estimate
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.statistics import (
     bootstrap,
@@ -52,6 +53,11 @@ def test_resampling_never_mixes_strata_and_strata_may_differ_in_length():
     drawn = resample([np.array([1.0, 2.0]), np.array([5.0, 6.0, 7.0])], 100, rng())
     assert [d.shape for d in drawn] == [(100, 2), (100, 3)]
     assert set(drawn[0].ravel()) == {1, 2} and set(drawn[1].ravel()) == {5, 6, 7}
+
+
+def test_an_estimate_has_no_interval_where_a_task_has_one_run():
+    assert estimate(mean, TASKS)[1] is not None
+    assert estimate(mean, [*TASKS, np.array([0.3])]) == (pytest.approx(2.7 / 4), None, None)
 
 
 def rng():

@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo import pictures
+from wpt_agents.zoo import pictures, sheets
 from wpt_agents.zoo.checkpoints import (
     LOGS,
     Checkpoint,
@@ -161,6 +161,9 @@ def _work(job: Run) -> dict[str, Any]:
         if dataset is not None and checkpoint is None:  # else it has retrieved already
             with clock("index"):
                 job.shared.index(model)
+                if job.retrieves:
+                    picture = job.folder / "retrieval.png"
+                    sheets.sheet_of_run(picture, model, job.task, job.shared.env, job.seed)
         clock.seconds["learn"] = round(_learn(job, model, checkpoint), 1)
         model.save(job.folder / "model.zip")
     with clock("evaluate"):

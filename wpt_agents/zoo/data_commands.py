@@ -243,7 +243,7 @@ def show_retrieval(
     assert agent.dataset is not None
     queries = [sheets.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [sheets.query_at(row, rendering) for row in rows]
+    queries += [sheets.query_at(row, {"rendering": rendering}) for row in rows]
     if not queries:
         chosen = sheets.spread(agent.dataset, 6)
         queries = [sheets.query_of(agent.dataset, i) for i in chosen]

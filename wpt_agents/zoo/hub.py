@@ -18,6 +18,7 @@ from wpt_agents.zoo.trained import find_trained
 FILES = (
     *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json", "command.txt"),
     *("evaluations.npz", "0.monitor.csv", "policy.mp4", "learning_curve.png", "predictions.png"),
+    "retrieval.png",
 )
 VIDEO = "replay.mp4"  # the name that the hub shows a policy's video under
 

@@ -105,6 +105,12 @@ class Run:
         return {**self.preset.wpt, **METHODS[self.method].wpt}
 
     @property
+    def retrieves(self) -> bool:
+        """Whether trajectories are retrieved, for rehearsal or for guidance."""
+        wpt = wpt_keywords() | self.wpt
+        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or wpt["guidance"])
+
+    @property
     def updates(self) -> int:
         """The fine-tuning updates that the run will make, within an episode's worth."""
         wpt = wpt_keywords() | self.wpt

@@ -36,14 +36,15 @@ class Finished:
         return f"{self.result['task']}-{one.method}-{one.preset}-{one.frames}-{self.result['seed']}"
 
     def media(self) -> dict[str, str]:
-        """Video and prediction strip as data URIs, by their file's name without its ending."""
+        """Video, predictions and what was retrieved, as data URIs by their files' stems."""
         found = {}
         if (video := self.folder / "policy.mp4").exists():
             found["policy"] = data_uri("video/mp4", video.read_bytes())
-        if (strip := self.folder / "predictions.png").exists():
-            pixels = imageio.imread(strip)[..., :3]
-            small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
-            found["predictions"] = data_uri("image/jpeg", small)
+        for name in ("predictions", "retrieval"):
+            if (picture := self.folder / f"{name}.png").exists():
+                pixels = imageio.imread(picture)[..., :3]
+                small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
+                found[name] = data_uri("image/jpeg", small)
         return found
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:

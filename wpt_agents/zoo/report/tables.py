@@ -10,8 +10,8 @@ from typing import Any, Self
 import numpy as np
 from rich.table import Table
 
-from wpt_agents.zoo.report.aggregates import references, score_of
-from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval
+from wpt_agents.zoo.report.aggregates import estimate, references, score_of
+from wpt_agents.zoo.statistics import mean, mean_interval
 
 POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
 
@@ -54,8 +54,9 @@ class PolicyRow:
 
     :param method: "" for a policy that no method has a part in
     :param means: of each seed, over its `episodes` episodes
-    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again
-    :param seeds_low: bootstrap of the seeds' means: were other seeds trained
+    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again;
+        None with one episode
+    :param seeds_low: bootstrap of the seeds' means: were other seeds trained; None with one seed
     :param t_low: the same by Student's t, which is wider for few seeds
     :param success: share of episodes that end in success, None where the task counts none
     """
@@ -69,8 +70,8 @@ class PolicyRow:
     seeds: tuple[int, ...]
     means: tuple[float, ...]
     mean: float
-    episodes_low: float
-    episodes_high: float
+    episodes_low: float | None
+    episodes_high: float | None
     seeds_low: float | None
     seeds_high: float | None
     t_low: float | None
@@ -94,8 +95,8 @@ class PolicyRow:
             tuple(seeds),
             tuple(means),
             middle,
-            *map(float, bootstrap(mean, returns)),
-            *(map(float, bootstrap(mean, [np.array(means)])) if len(seeds) > 1 else (None, None)),
+            *estimate(mean, returns)[1:],
+            *estimate(mean, [np.array(means)])[1:],
             *student,
             None if None in rates else float(np.mean(rates)),
             tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),

@@ -160,7 +160,7 @@ def retrieval_sheet(
                 f"#{i}  d {distance:.3g}\n{_kind(task, robot)}", fontsize=6.5, color=INK, pad=3
             )
     robots = "blue: the query's own robot, orange: another"
-    _finish(figure, path, f"First images and the nearest in {dataset.path} ({robots})")
+    _finish(figure, path, f"First images and the nearest in {dataset.path.name} ({robots})")
 
 
 def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], seed: int) -> None:

@@ -111,6 +111,8 @@ def joined(device: torch.device) -> Iterator[World]:
         yield World.current()
         return
     gpu = device if device.type == "cuda" else None
+    if gpu:
+        torch.cuda.set_device(gpu)  # objects, too, are sent by way of it
     dist.init_process_group("nccl" if gpu else "gloo", timeout=PATIENCE, device_id=gpu)
     try:
         yield World.current()
@@ -122,8 +124,7 @@ def local_device(device: torch.device | str = "auto") -> torch.device:
     """As SB3 reads it, but that torchrun's processes get a GPU each unless one is named."""
     device = get_device(device)
     if device.type == "cuda" and device.index is None and "LOCAL_RANK" in os.environ:
-        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-        torch.cuda.set_device(device)
+        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
     return device
 
 

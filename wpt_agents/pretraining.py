@@ -16,21 +16,21 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.distributed import Divided, World, joined, local_device
 from wpt_agents.importers.convert import Data
 from wpt_agents.model_file import read_model
+from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Batch
 from wpt_agents.updates import PRETRAIN, Updates, note, torch_seed
 
 EVERY = 1000  # steps between checkpoints
 
 
-class Pretraining(Updates):
+class Pretraining(Updates, Saving):
     """What `WPT` learns without a task."""
 
-    dataset: TrajectoryDataset | None
-    hyperparameters: dict[str, Any]
+    set_dataset: Callable[[Data | None], None]
+    set_env: Callable[[GymEnv | str], None]
     pretrain_steps: int
 
     @classmethod
@@ -148,5 +148,5 @@ class Pretraining(Updates):
 def _common(world: World, seed: int | None) -> int | None:
     """The seed given; where several processes got none, the same new one for all."""
     if seed is None and world.size > 1:
-        return world.rank_0s(int(np.random.SeedSequence().entropy % 2**31))
+        return world.rank_0s(torch_seed(np.random.default_rng()))
     return seed

@@ -41,12 +41,11 @@ from wpt_agents.pretraining import Pretraining
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, step_all
-from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, WARMUP, WINDOW, torch_seed
 
 
-class WPT(Pretraining, Saving, BaseAlgorithm):
+class WPT(Pretraining, BaseAlgorithm):
     """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
 
     Example::

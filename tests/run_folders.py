@@ -36,6 +36,8 @@ def make_run(out, task, seed=0, method="wpt", returns=(10.0, 20.0), frames=1000,
         arrays["successes"] = evaluations > 5
     np.savez(folder / "evaluations.npz", **arrays, ep_lengths=np.full((3, 2), 50))
     imwrite(folder / "predictions.png", PIXELS)
+    if method != "scratch":
+        imwrite(folder / "retrieval.png", PIXELS)
     (folder / "policy.mp4").write_bytes(b"not really a video")
     (folder / "result.json").write_text(json.dumps(result))
     return folder

@@ -183,6 +183,18 @@ def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
     assert model.learn(1).retrieved_ids == [2]
 
 
+def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
+    def found(start, seed):
+        model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
+        model.set_env(DotEnv())
+        model.env.seed(start)
+        return tuple(model.learn(1).retrieved_ids)
+
+    assert found(1, seed=0) == found(2, seed=0)
+    assert len({found(1, seed) for seed in range(6)}) > 1
+    assert all(i < 4 for seed in range(6) for i in found(1, seed))
+
+
 def test_retrieval_without_data_of_the_width_says_what_to_do(store):
     model = pretrained(store, env=DotEnv(actions=3))
     with pytest.raises(ValueError, match=r"no trajectory of 3 actions.*offline_ratio=0"):

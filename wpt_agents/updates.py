@@ -26,7 +26,7 @@ from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Batch
 from wpt_agents.world_model import WorldModelLoss, reward_loss, world_model_update_loss
 
-PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT = range(6)  # purposes of random streams
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE = range(7)  # purposes of random streams
 
 
 class Updates:

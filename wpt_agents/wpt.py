@@ -13,7 +13,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -42,7 +42,7 @@ from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, step_all
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.updates import ACT, CLONE, WARMUP, WINDOW, torch_seed
+from wpt_agents.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
 
 class WPT(Pretraining, BaseAlgorithm):
@@ -89,6 +89,7 @@ class WPT(Pretraining, BaseAlgorithm):
     :param guidance: schedule of the probability that an episode is guided; 0: none
     :param episode_length: steps of an episode, for the guidance window; found out if None
     :param num_retrieve: R, trajectories to retrieve
+    :param retrieval: "nearest", by Eq. (5), or "random", its ablation
     :param bc_steps: updates of the prior actor
     :param bc_batch_size: pairs in each
     :param bc_learning_rate: of the prior actor
@@ -137,6 +138,7 @@ class WPT(Pretraining, BaseAlgorithm):
         guidance: str | float = "linear(1,0,50000)",
         episode_length: int | None = None,
         num_retrieve: int = 500,
+        retrieval: str = "nearest",
         bc_steps: int = 150_000,
         bc_batch_size: int = 256,
         bc_learning_rate: float = 1e-4,
@@ -318,7 +320,10 @@ class WPT(Pretraining, BaseAlgorithm):
         assert self.dataset is not None
         width, retriever = self.action_space.shape[0], self.build_index(progress_bar)
         known = self.embodiment if self.embodiment in self.dataset.embodiments else None
-        found, _ = retriever.search(query, self.num_retrieve, known, width)
+        if self.retrieval == "random":
+            found = retriever.draw(self.num_retrieve, self._stream(RETRIEVE, 0), known, width)
+        else:
+            found, _ = retriever.search(query, self.num_retrieve, known, width)
         if len(found) == 0:
             raise ValueError(
                 f"The dataset {self.dataset.path} has no trajectory of {width} actions to "
@@ -460,6 +465,11 @@ class WPT(Pretraining, BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
 
-CHOICES = {"size": SIZES, "precision": ("fp32", "bf16"), "free_nats_mode": ("mean", "element")}
+CHOICES: dict[str, Collection[str]] = {
+    "size": SIZES,
+    "precision": ("fp32", "bf16"),
+    "free_nats_mode": ("mean", "element"),
+    "retrieval": ("nearest", "random"),
+}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}

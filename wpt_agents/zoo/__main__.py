@@ -12,6 +12,7 @@ import typer
 from wpt_agents.zoo import data_commands
 from wpt_agents.zoo.bench.command import bench
 from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.report.command import report
 
 app = typer.Typer(
     add_completion=False,
@@ -110,8 +111,8 @@ def run_benchmark(
     method: Annotated[
         list[str],
         typer.Option(
-            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain; several "
-            "allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
+            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain, "
+            "random-retrieval; several allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
         ),
     ] = ["wpt"],  # noqa: B006
     frames: Annotated[
@@ -199,7 +200,7 @@ def evaluate_model(
 
     Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
     """
-    from wpt_agents.zoo.report import interval_text, number
+    from wpt_agents.zoo.report.tables import interval_text, number
     from wpt_agents.zoo.trained import find_trained
 
     trained = find_trained(run, task)
@@ -227,7 +228,7 @@ def enjoy_model(
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
-    from wpt_agents.zoo.report import number
+    from wpt_agents.zoo.report.tables import number
     from wpt_agents.zoo.trained import find_trained
 
     if size % 16:
@@ -266,49 +267,7 @@ def pull_run(
     typer.echo(f"Pulled: {folder.resolve()}. Watch it: python -m wpt_agents.zoo enjoy {folder}")
 
 
-@app.command("report")
-def report_results(
-    folder: Annotated[Path, typer.Argument(help="Run folders are searched below it.")] = Path(
-        "runs"
-    ),
-    markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
-    csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
-    out: Annotated[
-        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
-    ] = None,
-    media: Annotated[
-        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
-    ] = "first",
-) -> None:
-    """Shows the mean over seeds of every task and method, and writes a page about all runs.
-
-    The page is one file that needs no network: the paper's tables beside yours, aggregates with
-    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
-    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
-    prior actor, WPT.
-    """
-    from wpt_agents.zoo import report
-    from wpt_agents.zoo.page import write_page
-    from wpt_agents.zoo.stages import console
-
-    results = report.read_results(folder)
-    if not results:
-        raise ValueError(f"No finished run below {folder}: there is no result.json.")
-    rows, policies = report.summarise(results), report.policies(results)
-    as_markdown = f"{report.markdown(rows)}\n{report.policy_markdown(policies)}"
-    if csv:
-        typer.echo(report.policy_csv(policies), nl=False)
-    elif markdown:
-        typer.echo(as_markdown, nl=False)
-    else:
-        page = (out or folder / "report") / "index.html"
-        write_page(folder, page, media)
-        page.with_name("report.md").write_text(as_markdown)
-        page.with_name("policies.csv").write_text(report.policy_csv(policies))
-        console.print(report.summary_table(rows))
-        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
-
-
+app.command("report")(report)
 app.command("bench")(bench)
 
 

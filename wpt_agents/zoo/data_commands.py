@@ -1,4 +1,4 @@
-"""The commands that make data and look at them: collect, import, data show, retrieve show.
+"""The commands that make data and look at them: collect, import, data ..., retrieve show.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -14,7 +14,7 @@ from wpt_agents.zoo.options import Spaced, Suite, Tasks, Workers
 if TYPE_CHECKING:
     from wpt_agents.dataset import TrajectoryDataset
 
-data = typer.Typer(no_args_is_help=True, help="Looks at a dataset.")
+data = typer.Typer(no_args_is_help=True, help="Looks at datasets, checks and joins them.")
 retrieve = typer.Typer(no_args_is_help=True, help="Looks at what retrieval finds.")
 Store = Annotated[Path, typer.Argument(help="A dataset's folder.")]
 Picture = Annotated[Path, typer.Option(help="Where the picture goes.")]
@@ -25,6 +25,8 @@ def register(app: typer.Typer) -> None:
     app.command("collect", cls=Spaced)(collect_data)
     app.command("import")(import_data)
     data.command("show")(show_data)
+    data.command("validate")(validate_data)
+    data.command("merge")(merge_data)
     app.add_typer(data, name="data")
     retrieve.command("show", cls=Spaced)(show_retrieval)
     app.add_typer(retrieve, name="retrieve")
@@ -174,6 +176,44 @@ def show_data(
         typer.echo(f"Contact sheet: {out.resolve()}")
 
 
+def validate_data(
+    folder: Store,
+    set_aside: Annotated[
+        bool, typer.Option("--set-aside", help="Leave the damaged ones out from now on.")
+    ] = False,
+) -> None:
+    """Reads every byte of a dataset and names the trajectories that are damaged.
+
+    Exits with 1 if there are any, unless they are set aside.
+
+    Example: `python -m wpt_agents.zoo data validate data/two`
+    """
+    from wpt_agents.dataset import TrajectoryDataset
+
+    dataset = TrajectoryDataset.open(folder)
+    asked = len(dataset)
+    damaged = dataset.validate(progress_bar=True, set_aside=set_aside)
+    for each in damaged:
+        typer.echo(f"trajectory {each.trajectory}: {each.reason}")
+    state = "set aside" if set_aside else "damaged"
+    typer.echo(f"{asked} trajectories read, {len(damaged)} {state}")
+    if damaged and not set_aside:
+        raise typer.Exit(1)
+
+
+def merge_data(
+    out: Annotated[Path, typer.Argument(metavar="DST", help="The new dataset's folder.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Datasets to join.")],
+) -> None:
+    """Makes a new dataset of all trajectories of others, in their order.
+
+    Example: `python -m wpt_agents.zoo data merge data/all data/noise data/curious`
+    """
+    from wpt_agents.dataset import TrajectoryDataset
+
+    _print_info(TrajectoryDataset.merge(out, folders))
+
+
 def show_retrieval(
     folder: Store,
     model: Annotated[Path, typer.Option(help="The model file whose encoder compares.")],
@@ -203,7 +243,7 @@ def show_retrieval(
     assert agent.dataset is not None
     queries = [sheets.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [sheets.query_at(row, rendering) for row in rows]
+    queries += [sheets.query_at(row, {"rendering": rendering}) for row in rows]
     if not queries:
         chosen = sheets.spread(agent.dataset, 6)
         queries = [sheets.query_of(agent.dataset, i) for i in chosen]

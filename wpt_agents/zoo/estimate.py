@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wpt_agents.zoo.plan import METHODS, Run
-from wpt_agents.zoo.report import read_results
+from wpt_agents.zoo.report.folders import read_results
 
 STORED_STEP, RAW_STEP = 2_500, 12_288  # bytes of an image: in the dataset (lossless), in the replay
 PARAMETERS = {"debug": 0.2e6, "tiny": 0.8e6, "small": 3e6, "medium": 18e6, "paper": 300e6}

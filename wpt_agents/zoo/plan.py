@@ -41,6 +41,7 @@ METHODS = {
     "no-guidance": Method(wpt={"guidance": 0.0}),
     "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
+    "random-retrieval": Method(wpt={"retrieval": "random"}),
 }
 ABLATION = {
     "scratch": "none",
@@ -102,6 +103,12 @@ class Run:
     def wpt(self) -> dict[str, Any]:
         """The keywords of WPT, the method's switches included."""
         return {**self.preset.wpt, **METHODS[self.method].wpt}
+
+    @property
+    def retrieves(self) -> bool:
+        """Whether trajectories are retrieved, for rehearsal or for guidance."""
+        wpt = wpt_keywords() | self.wpt
+        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or wpt["guidance"])
 
     @property
     def updates(self) -> int:

@@ -22,7 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents import wpt
+from wpt_agents import pretraining, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout
@@ -127,7 +127,7 @@ def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
 
 
 def test_killed_pretraining_goes_on_from_its_last_checkpoint(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(wpt, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "EVERY", 2)
 
     def stop(step, _):
         if step == 3:

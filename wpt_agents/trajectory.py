@@ -110,6 +110,13 @@ class Batch:
             **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)}
         )
 
+    def split(self, parts: int) -> list["Batch"]:
+        """Its rows in order, in `parts` batches of as many rows each."""
+        rows, left = divmod(len(self.image), parts)
+        assert left == 0, (len(self.image), parts)
+        streams = {f.name: getattr(self, f.name).split(rows) for f in fields(self)}
+        return [Batch(**{k: each[i] for k, each in streams.items()}) for i in range(parts)]
+
     def pin(self) -> "Batch":
         """The same batch in pinned memory."""
         return Batch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})

@@ -75,17 +75,29 @@ def pretrain_model(
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
+    accumulate: Annotated[
+        int, typer.Option(min=1, help="Passes over each batch, to save memory.")
+    ] = 1,
 ) -> None:
     """Pre-trains a preset's world model, on its data or yours; `run` reuses it.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
+
+    On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
+    from wpt_agents.distributed import joined, local_device
     from wpt_agents.zoo.presets import load_preset
-    from wpt_agents.zoo.stages import Shared
+    from wpt_agents.zoo.stages import Shared, console
 
     chosen = load_preset(suite, preset, settings)
-    shared = Shared(chosen, suite, out / "cache", workers, device, data)
-    typer.echo(f"Model: {shared.model(shared.data()).resolve()}")
+    shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
+    with joined(local_device(device)) as world:
+        console.quiet = world.rank > 0
+        with world.rank_0_first():
+            dataset = shared.data()
+        model = shared.model(dataset).resolve()
+        if world.rank == 0:
+            typer.echo(f"Model: {model}")
 
 
 @app.command("run", cls=Spaced)
@@ -138,12 +150,15 @@ def run_benchmark(
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
+    from wpt_agents.distributed import started_by_torchrun
     from wpt_agents.zoo.benchmark import run_all
     from wpt_agents.zoo.engines import Resources, run_on
     from wpt_agents.zoo.estimate import check_space, summary
     from wpt_agents.zoo.plan import make_plan, show_plan
     from wpt_agents.zoo.watch import watch as show_standings
 
+    if started_by_torchrun():
+        raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if dry_run:

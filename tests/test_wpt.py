@@ -499,6 +499,15 @@ def test_guidance_that_begins_later_has_a_clone_too(store):
     assert model.cloned
 
 
+def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):
+    with pytest.warns(UserWarning, match=r"No dataset: .*model.prior .*dataset=.*guidance=0"):
+        assert agent(DotEnv()).learn(LENGTH).prior is None
+    recwarn.clear()
+    agent(DotEnv(), offline_ratio=0, guidance=0).learn(LENGTH)
+    agent(DotEnv(), dataset=store).learn(LENGTH)
+    assert not [warning for warning in recwarn if "No dataset" in str(warning.message)]
+
+
 def test_a_seed_that_was_set_is_saved(tmp_path):
     model = agent(DotEnv())
     model.set_random_seed(5)

@@ -50,7 +50,7 @@ SECTIONS = {
 }
 
 
-def make_dot(action_repeat, rendering, render_size=None, render_mode="rgb_array"):
+def make_dot(action_repeat=1, rendering="fast", render_size=None, render_mode="rgb_array"):
     return toy_env.DotEnv(render_mode)
 
 
@@ -313,6 +313,13 @@ def call(monkeypatch, *words):
         (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
         (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),
         (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+        (["collect", "--out", "data", "--behaviour", "icn"], "Did you mean 'icm'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gama=1"], "mean 'gamma'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma is a"),
+        (["run", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
+        (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
+        (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),
+        (["pretrain", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
     ],
 )
 def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
@@ -320,9 +327,9 @@ def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
 ):
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, *words) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert "Traceback" not in told
+    told = capsys.readouterr()
+    assert message in told.err
+    assert "Traceback" not in told.err and told.out == ""  # refused before anything is begun
     assert list(tmp_path.iterdir()) == []
 
 
@@ -348,8 +355,22 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_pa
     assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
     told = capsys.readouterr().out
     assert told.count("dmc-cheetah-run-back ") == 2
-    assert "4 episodes to collect" in told
+    assert "4 episodes to collect" in told and "of 4 runs to do" in told
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
+    assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
+    told = capsys.readouterr()
+    assert "1 of 1 run to do" in told.out and "--device cuda:99" in told.err
+
+
+def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
+    assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0
+    told = capsys.readouterr().out
+    assert "embodiment" in told and "Dataset:" in told and "{" not in told
 
 
 def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):

@@ -88,8 +88,9 @@ def test_an_engine_that_is_not_installed_is_told_before_any_work(
 ):
     monkeypatch.setitem(sys.modules, module, None)  # what a missing module looks like
     words = ["run", "--tasks", "dot", "--preset", "debug", "--engine", engine]
-    assert call(monkeypatch, *words, "--out", tmp_path / "runs") == 2
-    assert f'pip install "wpt-agents[{engine}]"' in capsys.readouterr().err
+    for also in ([], ["--dry-run"]):
+        assert call(monkeypatch, *words, *also, "--out", tmp_path / "runs") == 2
+        assert f'pip install "wpt-agents[{engine}]"' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -26,7 +26,7 @@ IMAGE_SIZE = 64
 STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """One episode. Action t was taken at image t, brought reward t and led to image t + 1.
 
@@ -78,6 +78,12 @@ class Trajectory:
     def __len__(self) -> int:
         """The number of actions, T."""
         return len(self.action)
+
+    def __repr__(self) -> str:
+        """What it is of, without its pixels."""
+        names = f"embodiment={self.embodiment!r}, task={self.task!r}"
+        rewards = "known" if self.reward is not None else None
+        return f"Trajectory(T={len(self)}, {names}, action_dim={self.action_dim}, reward={rewards})"
 
 
 @dataclass(frozen=True)

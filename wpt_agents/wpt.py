@@ -44,6 +44,11 @@ from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, 
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
+NO_DATASET = (
+    "No dataset: nothing is rehearsed, no prior actor guides, and model.prior stays None. Give "
+    "dataset= to WPT or load, or say offline_ratio=0, guidance=0 if you mean it"
+)
+
 
 class WPT(Pretraining, BaseAlgorithm):
     """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
@@ -54,7 +59,7 @@ class WPT(Pretraining, BaseAlgorithm):
         model.set_env("wpt/dmc-walker-run-v0")
         model.learn(75_000).save("walker.zip")
 
-    Without pre-training and dataset, `WPT("WPTPolicy", env)` learns from scratch. The defaults are
+    `WPT("WPTPolicy", env, offline_ratio=0, guidance=0)` learns from scratch. The defaults are
     Table 2 of the paper; steps are calls of `env.step` (2 frames each at action repeat 2).
 
     :param policy: "WPTPolicy"
@@ -306,6 +311,8 @@ class WPT(Pretraining, BaseAlgorithm):
         if self.dataset is None and self.retrieved_ids and self.offline_ratio:
             warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
         wanted = self._guided() or self.offline_ratio
+        if self.dataset is None and wanted and not self.retrieved_ids:
+            warnings.warn(NO_DATASET, stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not wanted:
             return
         if not self.retrieved_ids or self.retrieved_of != self.dataset.fingerprint:

@@ -86,9 +86,11 @@ def pretrain_model(
     On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
     from wpt_agents.distributed import joined, local_device
+    from wpt_agents.zoo.machine import check_device
     from wpt_agents.zoo.presets import load_preset
     from wpt_agents.zoo.stages import Shared, console
 
+    check_device(device)
     chosen = load_preset(suite, preset, settings)
     shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
     with joined(local_device(device)) as world:
@@ -154,6 +156,7 @@ def run_benchmark(
     from wpt_agents.zoo.benchmark import run_all
     from wpt_agents.zoo.engines import Resources, run_on
     from wpt_agents.zoo.estimate import check_space, summary
+    from wpt_agents.zoo.machine import check_machine
     from wpt_agents.zoo.plan import make_plan, show_plan
     from wpt_agents.zoo.watch import watch as show_standings
 
@@ -161,14 +164,16 @@ def run_benchmark(
         raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
-    if dry_run:
-        show_plan(jobs, force)
-        typer.echo(summary(jobs))
-        return
     if watch:
         show_standings(jobs)
         return
+    if dry_run:
+        show_plan(jobs, force)
+        typer.echo(summary(jobs))
+    check_machine(engine, device)
     check_space(jobs)
+    if dry_run:
+        return
     if engine == "none":
         done = run_all(jobs, force)
     else:

@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.names import counted
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures, sheets
 from wpt_agents.zoo.checkpoints import (
@@ -254,7 +255,7 @@ def _evaluate(job: Run, model: WPT) -> tuple[WPT, dict[str, Score]]:
     :return: the model that counts, the best in between or the last, and all scores
     """
     episodes, seed = job.preset.evaluate.episodes, job.evaluation_seed
-    say("evaluate", f"{episodes} episodes of each policy, from the same initial states")
+    say("evaluate", f"{counted(episodes, 'episode')} of each policy, from the same initial states")
     scores = {name: job.shared.baseline(name, job.task, seed) for name in BASELINES}
     policies = {"prior actor": model.prior, "WPT": model}
     best = job.folder / "best_model.zip"

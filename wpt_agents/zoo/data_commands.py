@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wpt_agents.zoo.options import Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.options import Rendering, Spaced, Suite, Tasks, Workers
 
 if TYPE_CHECKING:
     from wpt_agents.dataset import TrajectoryDataset
@@ -59,7 +59,7 @@ def collect_data(
         list[str],
         typer.Option("--set", metavar="KEY=VALUE", help="For icm, plan2explore: WPT's keywords."),
     ] = [],  # noqa: B006
-    rendering: Annotated[str, typer.Option(help="exact, near or fast.")] = "near",
+    rendering: Annotated[Rendering, typer.Option(help="Of the pictures.")] = Rendering.near,
 ) -> None:
     """Plays tasks and stores the episodes, without rewards unless asked for.
 
@@ -77,12 +77,11 @@ def collect_data(
     ids = [row.id for row in find_tasks(suite, names)]
     episodes = episodes or (paper.episodes if paper else 30)
     behaviour = behaviour or (paper.behaviour if paper else "noise")
-    typer.echo(f"{len(ids)} tasks x {episodes} episodes, {behaviour}, in {out}")
     dataset = collect(
-        out, ids, episodes, seed, workers, behaviour, {"rendering": rendering},
+        out, ids, episodes, seed, workers, behaviour, {"rendering": str(rendering)},
         rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings),
     )  # fmt: skip
-    _print_info(dataset)
+    _print_summary(dataset)
 
 
 def import_data(
@@ -135,7 +134,7 @@ def import_data(
         warnings.showwarning = _show_warning
         episodes = open_episodes(source, None if form == "auto" else form, **shared, **options)
         dataset = TrajectoryDataset.from_episodes(episodes, out, progress_bar=True)
-    _print_info(dataset)
+    _print_summary(dataset)
 
 
 def _numbers(option: str, text: str | None) -> list[float] | None:
@@ -151,9 +150,13 @@ def _show_warning(message: Warning | str, *_: object) -> None:
     typer.secho(f"Warning: {message}", fg="yellow", err=True)
 
 
-def _print_info(dataset: "TrajectoryDataset") -> None:
-    for name, value in dataset.info().items():
-        typer.echo(f"{name:<16} {value}")
+def _print_summary(dataset: "TrajectoryDataset") -> None:
+    """What the dataset holds, robot by robot, and where it is."""
+    from wpt_agents.zoo.sheets import data_table
+    from wpt_agents.zoo.stages import console
+
+    console.print(data_table(dataset))
+    typer.echo(f"Dataset: {dataset.path.resolve()}")
 
 
 def show_data(
@@ -166,11 +169,10 @@ def show_data(
     Example: `python -m wpt_agents.zoo data show data/two --out two.png`
     """
     from wpt_agents.dataset import TrajectoryDataset
-    from wpt_agents.zoo.sheets import contact_sheet, data_table
-    from wpt_agents.zoo.stages import console
+    from wpt_agents.zoo.sheets import contact_sheet
 
     dataset = TrajectoryDataset.open(folder)
-    console.print(data_table(dataset))
+    _print_summary(dataset)
     if len(dataset):
         contact_sheet(out, dataset, rows)
         typer.echo(f"Contact sheet: {out.resolve()}")
@@ -211,7 +213,7 @@ def merge_data(
     """
     from wpt_agents.dataset import TrajectoryDataset
 
-    _print_info(TrajectoryDataset.merge(out, folders))
+    _print_summary(TrajectoryDataset.merge(out, folders))
 
 
 def show_retrieval(
@@ -222,7 +224,7 @@ def show_retrieval(
     ] = [],  # noqa: B006
     task: Annotated[list[str], typer.Option(help="Tasks whose first image to search for.")] = [],  # noqa: B006
     suite: Suite = "dmc",
-    rendering: Annotated[str, typer.Option(help="Of --task: exact, near or fast.")] = "near",
+    rendering: Annotated[Rendering, typer.Option(help="Of --task.")] = Rendering.near,
     number: Annotated[int, typer.Option(min=1, help="How many of the nearest.")] = 8,
     own_robot: Annotated[
         bool, typer.Option("--own-robot", help="Only its robot and action width, as WPT does.")
@@ -243,7 +245,7 @@ def show_retrieval(
     assert agent.dataset is not None
     queries = [sheets.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [sheets.query_at(row, {"rendering": rendering}) for row in rows]
+    queries += [sheets.query_at(row, {"rendering": str(rendering)}) for row in rows]
     if not queries:
         chosen = sheets.spread(agent.dataset, 6)
         queries = [sheets.query_of(agent.dataset, i) for i in chosen]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wpt_agents.names import counted
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.report.folders import read_results
 
@@ -72,6 +73,6 @@ def summary(jobs: Sequence[Run]) -> str:
     )
     updates = sum(job.updates for job in jobs if job.result() is None)
     return (
-        f"{left} of {len(jobs)} runs to do, {updates:,} updates; one after the other: {time}; "
-        f"disk: about {gigabytes(disk_needed(jobs))}"
+        f"{left} of {counted(len(jobs), 'run')} to do, {counted(updates, 'update')}; "
+        f"one after the other: {time}; disk: about {gigabytes(disk_needed(jobs))}"
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from wpt_agents.zoo.engines import import_extra
+from wpt_agents.zoo.machine import import_extra
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.report.aggregates import score_of
 from wpt_agents.zoo.trained import find_trained

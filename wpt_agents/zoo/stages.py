@@ -25,6 +25,7 @@ from wpt_envs.tasks import Task
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.distributed import World
+from wpt_agents.names import counted
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.checkpoints import ContinuedCSV
 from wpt_agents.zoo.collect import collect
@@ -139,7 +140,7 @@ class Shared:
         """Stage 1: the dataset, collected unless it is there; half of one is continued."""
         if self.given_data is not None:
             dataset = TrajectoryDataset.open(self.given_data)
-            say("collect", f"given, {len(dataset)} episodes  [dim]{self.data_path}")
+            say("collect", f"given, {counted(len(dataset), 'episode')}  [dim]{self.data_path}")
             return dataset
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
@@ -149,7 +150,8 @@ class Shared:
             found = 0  # `collect` says what is wrong
         state = "reused" if found == wanted else f"continued at {found} of" if found else "making"
         names = ", ".join(given.tasks) or f"all tasks of {self.suite}"
-        say("collect", f"{state} {wanted} reward-free episodes of {names}  [dim]{self.data_path}")
+        episodes = counted(wanted, "reward-free episode")
+        say("collect", f"{state} {episodes} of {names}  [dim]{self.data_path}")
         return collect(
             self.data_path,
             self.tasks,
@@ -167,7 +169,8 @@ class Shared:
         with locked(folder / "lock", wait=True) if world.rank == 0 else nullcontext():
             finished = world.rank_0s(done.exists())
             state = "reused" if finished else "continued" if model.exists() else "making"
-            say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
+            updates = counted(given.steps, "update")
+            say("pretrain", f"{state} a world model of {updates}  [dim]{folder}")
             if not finished:
                 start = time.perf_counter()
                 with log_in(folder) if world.rank == 0 else nullcontext() as callback:

@@ -10,7 +10,7 @@ import jinja2
 import yaml
 
 from wpt_agents.archive import replacing
-from wpt_agents.names import unknown_name
+from wpt_agents.names import counted, unknown_name
 from wpt_agents.zoo.report import aggregates, sections, tables
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
 from wpt_agents.zoo.report.sections import Names
@@ -35,7 +35,12 @@ def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: st
     """The page's HTML."""
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    env.filters |= {"number": tables.number, "share": "{:.2f}".format, "count": "{:,}".format}
+    env.filters |= {
+        "number": tables.number,
+        "share": "{:.2f}".format,
+        "count": "{:,}".format,
+        "counted": counted,
+    }
     runs = sorted(runs, key=_order)
     names, results = Names(run.experiment for run in runs), [run.result for run in runs]
     suites = dict.fromkeys(run.result["suite"] for run in runs)

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from rich.table import Table
 
+from wpt_agents.names import counted
 from wpt_agents.zoo.report.aggregates import estimate, references, score_of
 from wpt_agents.zoo.statistics import mean, mean_interval
 
@@ -152,8 +153,8 @@ def number(value: float | None) -> str:
 def scores_table(result: Mapping[str, Any]) -> Table:
     """The policies of one run side by side."""
     about = f"{result['task']}, {result['method']}, seed {result['seed']}"
-    episodes = len(result["scores"]["WPT"]["returns"])
-    caption = f"{episodes} episodes each, after {result['frames']:,} frames of fine-tuning"
+    episodes = counted(len(result["scores"]["WPT"]["returns"]), "episode")
+    caption = f"{episodes} each, after {result['frames']:,} frames of fine-tuning"
     table = Table(title=about, caption=caption)
     table.add_column("policy")
     for heading in ("mean return", "95 % interval", "lowest", "highest"):
@@ -238,7 +239,7 @@ def policy_markdown(rows: Sequence[PolicyRow]) -> str:
         seeds = sorted({seed for row in table for seed in row.seeds})
         commits = sorted({commit for row in table for commit in row.commits})
         episodes = min(row.episodes for row in table)
-        about = f"Seeds {', '.join(map(str, seeds))}, {episodes} episodes each; "
+        about = f"Seeds {', '.join(map(str, seeds))}, {counted(episodes, 'episode')} each; "
         about += f"commit {', '.join(commits)}."
         lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
         parts.append(f"### {title}\n\n{lines}\n{about}\n")

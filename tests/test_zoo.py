@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -15,10 +14,10 @@ from run_folders import make_run
 from scipy import stats
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from wpt_envs.tasks import TASKS, Task
+from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import benchmark, stages
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate
@@ -287,14 +286,6 @@ def test_the_csv_reads_back_unrounded():
     assert read["means"] == f"{rows[0].means[0]} {rows[0].means[1]}" and read["seeds"] == "0 4"
     assert float(read["mean"]) == rows[0].mean
     assert read["success"] == ""
-
-
-def call(monkeypatch, *words):
-    """What `python -m wpt_agents.zoo WORDS` ends with: its exit code."""
-    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
-    with pytest.raises(SystemExit) as end:
-        command_line.main()
-    return end.value.code
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
-from test_zoo import call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
 
 from wpt_agents.zoo import engines, stages
 from wpt_agents.zoo.engines import Local, Ray, Resources, Slurm, run_on

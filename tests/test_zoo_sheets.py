@@ -1,7 +1,5 @@
 """A look at the data: the table's numbers, and that the pictures show what they say."""
 
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,20 +7,11 @@ from debug_agent import agent, recorded
 from PIL import Image
 from toy_env import DotEnv
 from wpt_envs.tasks import find
+from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import sheets
-
-
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
-    try:
-        command_line.main()
-    except SystemExit as stopped:
-        return stopped.code
-    return 0
 
 
 @pytest.fixture

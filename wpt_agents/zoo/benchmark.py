@@ -215,6 +215,7 @@ def _learn(job: Run, model: WPT, checkpoint: Checkpoint | None) -> float:
     model.set_logger(logger)
     if checkpoint is not None:
         checkpoint.restore(model, job.folder)
+        assert model.env is not None
         go_to_episode(model.env, model.episodes)
     with closing(logger), _evaluation(job) as evaluation:
         repeat = job.preset.env.action_repeat

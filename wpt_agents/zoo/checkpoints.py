@@ -16,7 +16,7 @@ import warnings
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -209,8 +209,6 @@ def go_to_episode(venv: VecEnv, number: int) -> None:
 
 class ContinuedCSV(CSVOutputFormat):
     """SB3's `progress.csv`, which goes on with the rows that are there."""
-
-    file: TextIO
 
     def __init__(self, path: Path) -> None:
         before = path.read_text() if path.exists() else ""

@@ -146,7 +146,7 @@ def _numbers(option: str, text: str | None) -> list[float] | None:
         raise ValueError(f"{option} wants numbers with commas between, got {text!r}") from None
 
 
-def _show_warning(message: Warning | str, *_: object) -> None:
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     typer.secho(f"Warning: {message}", fg="yellow", err=True)
 
 

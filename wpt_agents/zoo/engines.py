@@ -59,7 +59,8 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     jobs = [_at_absolute_paths(job) for job in jobs]
     for job in jobs:
         benchmark.check_folder(job, force)
-    runner = {"local": Local, "ray": Ray, "slurm": Slurm}[engine](given)
+    runners: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
+    runner = runners[engine](given)
     left = [job for job in jobs if force or job.result() is None]
     for job in left if force else ():
         with locked(job.folder / "lock"):

@@ -46,7 +46,8 @@ class SavedPolicy:
 
     def __init__(self, rng: np.random.Generator, name: str, sigma: float, width: int) -> None:
         self.rng, self.model, self.sigma = rng, load_policy(name), sigma
-        self.sees_states, self.state = sees_states(name), None
+        self.sees_states = sees_states(name)
+        self.state: tuple[np.ndarray, ...] | None = None
         if self.model.action_space.shape != (width,):
             raise ValueError(
                 f"{name} acts in {self.model.action_space}, the task takes {width} actions; give a "

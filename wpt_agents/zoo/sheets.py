@@ -43,8 +43,8 @@ def data_table(dataset: TrajectoryDataset) -> Table:
     for name in ("with\nreward", "MiB on\ndisk", "bytes a\nframe", "of the\nraw size"):
         table.add_column(name, justify="right")
     groups: dict[str | None, list[int]] = defaultdict(list)
-    for i, name in enumerate(dataset.embodiments):
-        groups[name].append(i)
+    for i, robot in enumerate(dataset.embodiments):
+        groups[robot].append(i)
     rows = {name or "unnamed": dataset.subset(ids) for name, ids in groups.items()}
     for name, part in rows.items():
         table.add_row(name, *_row(part))
@@ -76,8 +76,8 @@ def spread(dataset: TrajectoryDataset, number: int) -> list[int]:
         groups[robot or "", task or ""].append(i)
     number = min(number, len(dataset))
     if number <= len(groups):
-        at = np.linspace(0, len(groups) - 1, number).round().astype(int)
-        return [list(groups.values())[i][0] for i in at]
+        places = np.linspace(0, len(groups) - 1, number).round().astype(int)
+        return [list(groups.values())[i][0] for i in places]
     turns = sorted((turn, at) for at, ids in enumerate(groups.values()) for turn in range(len(ids)))
     wanted = Counter(at for _, at in turns[:number])
     chosen = []

@@ -4,6 +4,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,7 +20,7 @@ SERIES = ("#a10001", "#a10002", "#a10003", "#a10004", "#a10005", "#a10006")
 VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"} | {
     colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, 1)
 }
-STYLE = {
+STYLE: dict[Any, Any] = {  # matplotlib lists the keys' names as their type
     **{"svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9},
     **{"text.color": INK, "axes.edgecolor": GRID, "axes.labelcolor": MUTED},
     **{"xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": MUTED},

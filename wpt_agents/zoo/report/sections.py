@@ -211,13 +211,13 @@ def curve(label: str, seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> figures
     The interval resamples the seeds' means; of one seed, its episodes.
     """
     reached = min(len(frames) for frames, _ in seeds)
-    middle, low, high = [], [], []
+    bands = []
     for at in range(reached):
         scores = [each[at] for _, each in seeds]
         strata = [np.array([s.mean() for s in scores])] if len(scores) > 1 else scores
-        value, ends = mean(strata), bootstrap(mean, strata, draws=2000)
-        middle.append(value), low.append(ends[0]), high.append(ends[1])
-    return figures.Line(label, seeds[0][0][:reached], tuple(map(np.array, (middle, low, high))))
+        bands.append((mean(strata), *bootstrap(mean, strata, draws=2000)))
+    middle, low, high = np.array(bands).reshape(-1, 3).T
+    return figures.Line(label, seeds[0][0][:reached], (middle, low, high))
 
 
 def paper_tables(runs: Sequence[Finished], names: Names) -> list[dict[str, Any]]:

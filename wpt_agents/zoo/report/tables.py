@@ -89,18 +89,23 @@ class PolicyRow:
         returns = [np.array(runs[seed]["returns"], float) for seed in seeds]
         means = [float(each.mean()) for each in returns]
         rates = [runs[seed]["success_rate"] for seed in seeds]
-        middle, *student = mean_interval(means)
+        _, episodes_low, episodes_high = estimate(mean, returns)
+        _, seeds_low, seeds_high = estimate(mean, [np.array(means)])
+        middle, t_low, t_high = mean_interval(means)
         return cls(
             *group,
-            min(map(len, returns)),
-            tuple(seeds),
-            tuple(means),
-            middle,
-            *estimate(mean, returns)[1:],
-            *estimate(mean, [np.array(means)])[1:],
-            *student,
-            None if None in rates else float(np.mean(rates)),
-            tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),
+            episodes=min(map(len, returns)),
+            seeds=tuple(seeds),
+            means=tuple(means),
+            mean=middle,
+            episodes_low=episodes_low,
+            episodes_high=episodes_high,
+            seeds_low=seeds_low,
+            seeds_high=seeds_high,
+            t_low=t_low,
+            t_high=t_high,
+            success=None if None in rates else float(np.mean(rates)),
+            commits=tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),
         )
 
 

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 import torch
 from torch import Generator, Tensor
+from torch.autograd.graph import increment_version
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 
@@ -178,6 +179,7 @@ class Updates:
                 "them, and look at the data or lower the learning rate"
             )
         optimizer.step()
+        increment_version(sum(groups, []))  # fused steps do not, and `FastStep` looks at it
         return norms[0]
 
     def _autocast(self) -> AbstractContextManager[None]:

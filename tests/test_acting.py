@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from debug_agent import agent, noise
-from toy_env import LENGTH, DotEnv
 from torch.utils._python_dispatch import TorchDispatchMode
+from toy_env import LENGTH, DotEnv
 
 from wpt_agents.acting import PATCHES, FastStep
 
@@ -93,6 +93,15 @@ def test_updates_and_loaded_and_replaced_weights_are_noticed():
         vector = policy.parameters_to_vector()
         policy.load_from_vector(vector + np.random.default_rng(seed).normal(0, 0.1, vector.shape))
         assert_defined(policy)
+
+
+def test_images_may_lie_in_memory_as_they_like():
+    policy, image = agent().policy, noise(2)
+    turned = np.ascontiguousarray(image.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
+    action, other = (
+        policy.act(each, None, None, deterministic=True)[0] for each in (image, turned)
+    )
+    np.testing.assert_array_equal(action, other)
 
 
 def test_foreign_networks_act_by_the_definition():

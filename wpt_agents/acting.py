@@ -83,7 +83,8 @@ class FastEncoder:
 
     def __call__(self, image: Tensor) -> Tensor:
         """(N, 64, 64, C) uint8 -> (N, E)."""
-        x = image.float()
+        assert image.shape[1:3] == (64, 64) and image.dtype == torch.uint8, image.shape
+        x = image.contiguous().float()
         for layer in self.layers:
             x = layer(x)
         return x.flatten(1)
@@ -146,8 +147,8 @@ class FastFilter:
 
 
 def in_blocks(x: Tensor, blocks: int) -> Tensor:
-    """(N, width) -> (blocks, N, width / blocks), without a copy."""
-    return x.view(len(x), blocks, -1).transpose(0, 1)
+    """(N, width) -> (blocks, N, width / blocks)."""
+    return x.reshape(len(x), blocks, -1).transpose(0, 1)
 
 
 class FastActor:

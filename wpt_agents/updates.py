@@ -179,7 +179,8 @@ class Updates:
                 "them, and look at the data or lower the learning rate"
             )
         optimizer.step()
-        increment_version(sum(groups, []))  # fused steps do not, and `FastStep` looks at it
+        for weights in groups:  # fused steps do not, and `FastStep` looks at it
+            increment_version(weights)
         return norms[0]
 
     def _autocast(self) -> AbstractContextManager[None]:

@@ -14,7 +14,7 @@ LAYERS = [
     {"trajectory", "distributions", "networks", "guidance", "archive", "names", "codecs"},
     {"windows", "index", "shards", "model_file", "scan", "importers"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
-    {"retrieval", "world_model", "checks"},
+    {"retrieval", "world_model", "checks", "acting"},
     {"policy"},
     {"rollout", "updates", "saving", "distributed"},
     {"pretraining"},

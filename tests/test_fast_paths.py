@@ -3,7 +3,7 @@
 from collections import defaultdict
 
 import torch
-from debug_agent import agent, recorded, weights
+from debug_agent import agent, pretrained, recorded, weights
 from torch import nn
 
 from wpt_agents import networks
@@ -45,3 +45,21 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
         # Adam's first steps divide by the gradient itself, so that rounding moves a weight whose
         # gradient is nearly zero by up to the learning rate, 1e-3; hardly any is
         assert (weight - expected[name]).abs().mean() < 2e-5, name
+
+
+def test_bfloat16_leaves_the_curve_of_pretraining_as_it_is():
+    episodes = [recorded(seed=seed) for seed in range(4)]
+
+    def curve(precision):
+        losses = []
+        pretrained(
+            episodes,
+            steps=40,
+            precision=precision,
+            callback=lambda _, metrics: losses.append(metrics["train/reconstruction_loss"]),
+        )
+        return torch.tensor(losses).unfold(0, 10, 10).mean(1)
+
+    exact, rounded = curve("fp32"), curve("bf16")
+    assert exact[-1] < 0.7 * exact[0]  # it learns
+    torch.testing.assert_close(rounded, exact, rtol=0.05, atol=0)

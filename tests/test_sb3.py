@@ -82,6 +82,8 @@ def test_it_learns_in_a_subproc_vec_env(n):
     finally:
         env.close()
     assert len(model.replay_buffer.trajectories) == 2 * n and 0 < mean < LENGTH
+    in_one_process = agent(DummyVecEnv([DotEnv] * n)).learn(2 * LENGTH * n)
+    assert same(weights(model), weights(in_one_process))
 
 
 def test_a_worker_that_dies_is_told_and_learning_goes_on_in_new_ones():

@@ -64,7 +64,24 @@ def test_observe_takes_the_scan_when_it_learns_on_a_cpu(monkeypatch):
     arguments = noise(B, T, E), noise(B, T, A), is_first
     with torch.no_grad():
         rssm.observe(*arguments)
-    with torch.autocast("cpu", torch.bfloat16):
-        rssm.observe(*arguments)
     with pytest.raises(pytest.fail.Exception, match="scanned"):
         rssm.observe(*arguments)
+
+
+def test_in_bfloat16_the_scan_stays_in_float32():
+    rssm, _, is_first = ways(0.01)
+    embed, action = noise(B, T, E), noise(B, T, A)
+    with torch.autocast("cpu", torch.bfloat16):
+        post, logits, prior_logits = rssm.observe(
+            embed, action, is_first, generator=torch.Generator().manual_seed(5)
+        )
+        embed_half = rssm._embed_half(embed).float()
+        keep = (~is_first[..., None]).float()
+        action_embed = rssm.gru.from_action(action * keep).float()
+    expected, expected_logits = rssm._filter(
+        embed_half, action_embed, is_first, rssm.initial(B), torch.Generator().manual_seed(5)
+    )
+    assert post.deter.dtype == logits.dtype == torch.float32
+    torch.testing.assert_close((post, logits), (expected, expected_logits), rtol=1e-4, atol=1e-5)
+    (post.deter.sum() + prior_logits.sum()).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in rssm.gru.parameters())

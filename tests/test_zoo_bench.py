@@ -47,6 +47,13 @@ def test_the_median_leaves_the_warm_up_out():
     assert len(calls) == 5
 
 
+def test_one_thread_counts_processor_time_and_several_wall_clock(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for threads, counted in ((1, "processor"), (2, "wall")):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        assert timing.cost("processor", "wall") == counted
+
+
 def test_the_other_cases_yield_rows():
     (acting,) = policy.rows(quick=True)
     assert acting["batch"] == 1 and acting["median_s"] > 0

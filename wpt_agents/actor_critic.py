@@ -94,7 +94,12 @@ class Actor(Head):
         :param feat: (..., D + S*K)
         :param mask: (A,) bool, True at the embodiment's own entries
         """
-        mean, std = self(feat).float().chunk(2, -1)
+        return self.truncated(self(feat), mask)
+
+    @staticmethod
+    def truncated(outputs: Tensor, mask: Tensor) -> TruncatedNormal:
+        """The distribution that the network's outputs (..., 2 A) stand for."""
+        mean, std = outputs.float().chunk(2, -1)
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
 
 

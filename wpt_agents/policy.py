@@ -1,6 +1,7 @@
 """All networks in one module, and how they act: filter a latent, then the actor decides."""
 
 import hashlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
+from wpt_agents.acting import FastStep
 from wpt_agents.actor_critic import Actor, Critic
 from wpt_agents.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.networks import Size, frozen
@@ -84,6 +86,7 @@ class WPTPolicy(BasePolicy):
         self.register_buffer("return_scale", torch.ones(()))
         self.reset_behavior()
         self.generator: Generator | None = None  # of collection; `predict` leaves it alone
+        self._fast_step: FastStep | None = None
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
@@ -132,26 +135,55 @@ class WPTPolicy(BasePolicy):
                 f"The state is of {len(state[0])} environments, the observation of {n}: pass "
                 "state=None where all episodes begin"
             )
-        deter, stoch, action = (self._tensor(x) for x in state or self.initial_state(n))
+        *latent, action = (self._tensor(x) for x in state or self.initial_state(n))
         first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
-        embed = self.world_model.encoder(self._tensor(image))
-        post = self.world_model.rssm.filter_step(
-            Latent(deter, stoch),
+        post, outputs = self._stepper()(
+            self._tensor(image),
+            Latent(*latent),
             action,
-            embed,
             self._tensor(first),
             generator,
             sample=not deterministic,
         )
-        dist = self.actor.dist(post.feat, self.action_mask)
+        dist = self.actor.truncated(outputs, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
-        if not torch.isfinite(action).all():
-            raise ValueError("The actor's output is not finite: the weights are damaged")
         state = tuple(x.cpu().numpy() for x in (*post, action))
+        if not np.isfinite(state[-1]).all():
+            raise ValueError("The actor's output is not finite: the weights are damaged")
         return state[-1], state
 
+    def step(
+        self,
+        image: Tensor,
+        state: Latent,
+        action: Tensor,
+        is_first: Tensor,
+        generator: Generator | None = None,
+        sample: bool = True,
+    ) -> tuple[Latent, Tensor]:
+        """One step of filtering and the actor's outputs; `FastStep` computes the same on a CPU.
+
+        :param image: (N, 64, 64, 3) uint8
+        :param state: of the step before, (N, ...)
+        :param action: (N, A), what led to the image
+        :param is_first: (N,) bool, where state and action are reset
+        :return: the posterior state, and what `Actor.truncated` takes, (N, 2 A)
+        """
+        rssm, embed = self.world_model.rssm, self.world_model.encoder(image)
+        post = rssm.filter_step(state, action, embed, is_first, generator, sample)
+        return post, self.actor(post.feat)
+
+    def _stepper(self) -> Callable[..., tuple[Latent, Tensor]]:
+        """`step`, or the like of it that was made for the present weights."""
+        networks = self.world_model.encoder, self.world_model.rssm, self.actor
+        if not FastStep.takes(*networks):
+            return self.step
+        if self._fast_step is None or not self._fast_step.is_of(*networks):
+            self._fast_step = FastStep(*networks)
+        return self._fast_step
+
     def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.asarray(array)).to(self.device)
+        return torch.from_numpy(np.asarray(array)).to(self.action_mask.device)
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
         """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
@@ -278,13 +310,13 @@ def stack_frames(
     :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
     :param episode_start: (n,) bool
     """
-    fresh = np.repeat(image[:, None], FRAMES, 1)
     if frames is None:
-        return fresh
+        return np.repeat(image[:, None], FRAMES, 1)
     moved = np.concatenate([frames[:, 1:], image[:, None]], 1)
-    if episode_start is None:
-        return moved
-    return np.where(np.asarray(episode_start, bool)[:, None, None, None, None], fresh, moved)
+    if episode_start is not None:
+        first = np.asarray(episode_start, bool)
+        moved[first] = image[first, None]
+    return moved
 
 
 @torch.no_grad()

@@ -156,10 +156,12 @@ class RSSM(nn.Module):
         state = state or self.initial(batch)
         action_embed = self.gru.from_action(action * (~is_first[..., None]).to(embed.dtype))
         embed_half = self._embed_half(embed)
-        # a device with a queue of its own would gain less, and autocast knows no such function
-        by_hand = embed.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
-        if by_hand and sample and torch.is_grad_enabled():
-            post, post_logits = self._scan(embed_half, action_embed, is_first, state, generator)
+        # a device with a queue of its own would gain less
+        if embed.device.type == "cpu" and sample and torch.is_grad_enabled():
+            with torch.autocast("cpu", enabled=False):  # which knows no such function
+                post, post_logits = self._scan(
+                    embed_half.float(), action_embed.float(), is_first, state, generator
+                )
         else:
             post, post_logits = self._filter(
                 embed_half, action_embed, is_first, state, generator, sample

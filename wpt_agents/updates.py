@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Generator, Tensor
+from torch.autograd.graph import increment_version
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 
@@ -178,6 +179,8 @@ class Updates:
                 "them, and look at the data or lower the learning rate"
             )
         optimizer.step()
+        for weights in groups:  # fused steps do not, and `FastStep` looks at it
+            increment_version(weights)
         return norms[0]
 
     def _autocast(self) -> AbstractContextManager[None]:

@@ -98,7 +98,7 @@ class WPT(Pretraining, BaseAlgorithm):
     :param bc_steps: updates of the prior actor
     :param bc_batch_size: pairs in each
     :param bc_learning_rate: of the prior actor
-    :param precision: "fp32", or "bf16" for the forward passes
+    :param precision: "fp32", or "bf16" for the forward passes; on a CPU it pays from `small` on
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 nothing, 1 information
     :param seed: of everything that is drawn

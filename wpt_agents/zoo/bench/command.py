@@ -28,7 +28,9 @@ def bench(
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
 ) -> None:
-    """Measures speed on this machine: medians of processor time after a warm-up.
+    """Measures speed on this machine: medians after a warm-up.
+
+    On one thread of a CPU of processor time, else of wall-clock.
 
     `share_of_ceiling` compares with a large matmul in the same run; work is counted, not guessed.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from wpt_agents.trajectory import Batch
 from wpt_agents.updates import UPDATE
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo.bench.timing import ceiling, gflop, peak_rss_mb, seconds
+from wpt_agents.zoo.bench.timing import ceiling, cost, gflop, peak_rss_mb, seconds
 
 ACTIONS = 6
 CASES = (  # size, batch, length: what grows with each, then what the paper's batch costs
@@ -44,7 +44,7 @@ def measured(step: Callable[[], Any], about: dict[str, Any], repetitions: int) -
     before = ceiling(device=device)
     processor, wall = seconds(step, repetitions)
     limit = (before + ceiling(device=device)) / 2
-    median = processor if device == "cpu" else wall
+    median = cost(processor, wall)
     return {
         **about,
         "threads": torch.get_num_threads(),

@@ -7,7 +7,7 @@ import torch
 
 from wpt_agents.policy import State
 from wpt_agents.zoo.bench.model import agent
-from wpt_agents.zoo.bench.timing import peak_rss_mb, seconds
+from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds
 
 
 def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
@@ -35,7 +35,7 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
                 "batch": n,
                 "threads": threads,
                 "dtype": "fp32",
-                "median_s": processor,
+                "median_s": cost(processor, wall),
                 "wall_s": wall,
                 "rss_mb": peak_rss_mb(),
             }

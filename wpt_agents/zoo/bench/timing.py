@@ -32,6 +32,14 @@ def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple
     return statistics.median(processor), statistics.median(wall)
 
 
+def cost(processor: float, wall: float) -> float:
+    """Which of the two counts: processor time of one thread, as other processes disturb it less.
+
+    Where several threads or a GPU take part, their speed is a matter of wall-clock.
+    """
+    return processor if torch.get_num_threads() == 1 and not torch.cuda.is_available() else wall
+
+
 def _wait() -> None:
     if torch.cuda.is_available():
         torch.cuda.synchronize()
@@ -40,8 +48,7 @@ def _wait() -> None:
 def ceiling(dtype: torch.dtype = torch.float32, device: str = "cpu", side: int = 1024) -> float:
     """GFLOP/s of a matmul of two square matrices: no network does more on this machine."""
     a, b = (torch.randn(side, side).to(device, dtype) for _ in range(2))
-    processor, wall = seconds(lambda: a @ b, repetitions=5)
-    return 2 * side**3 / (processor if device == "cpu" else wall) / 1e9
+    return 2 * side**3 / cost(*seconds(lambda: a @ b, repetitions=5)) / 1e9
 
 
 def gflop(step: Callable[[], Any]) -> float:

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents import updates, wpt
+from wpt_agents import pretraining, updates, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.wpt import WPT
@@ -235,7 +235,7 @@ def test_a_clone_whose_loss_is_nan_stops_with_finite_weights(monkeypatch):
 
 
 def test_pretraining_that_diverges_keeps_its_last_checkpoint(monkeypatch, tmp_path):
-    monkeypatch.setattr(wpt, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "EVERY", 2)
 
     def damage(step, _):
         if step == 3:

@@ -71,3 +71,9 @@ def test_stacked_windows_keep_to_the_chain():
 def test_a_wrong_trajectory_is_refused(arguments, culprit):
     with pytest.raises(ValueError, match=culprit):
         Trajectory(**{"image": IMAGE, "action": ACTION, **arguments})
+
+
+def test_it_is_shown_without_its_pixels():
+    shown = "Trajectory(T=3, embodiment='arm', task=None, action_dim=2, reward=None)"
+    assert repr(Trajectory(IMAGE, ACTION, embodiment="arm")) == shown
+    assert "reward=known" in repr(Trajectory(IMAGE, ACTION, np.zeros(3)))

@@ -22,7 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents import wpt
+from wpt_agents import pretraining, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout
@@ -127,7 +127,7 @@ def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
 
 
 def test_killed_pretraining_goes_on_from_its_last_checkpoint(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(wpt, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "EVERY", 2)
 
     def stop(step, _):
         if step == 3:
@@ -181,6 +181,18 @@ def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
     model.set_env(DotEnv())
     model.env.seed(2)
     assert model.learn(1).retrieved_ids == [2]
+
+
+def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
+    def found(start, seed):
+        model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
+        model.set_env(DotEnv())
+        model.env.seed(start)
+        return tuple(model.learn(1).retrieved_ids)
+
+    assert found(1, seed=0) == found(2, seed=0)
+    assert len({found(1, seed) for seed in range(6)}) > 1
+    assert all(i < 4 for seed in range(6) for i in found(1, seed))
 
 
 def test_retrieval_without_data_of_the_width_says_what_to_do(store):
@@ -485,6 +497,15 @@ def test_another_task_starts_from_returns_of_no_known_scale():
 def test_guidance_that_begins_later_has_a_clone_too(store):
     model = pretrained(store, env=DotEnv(), guidance="linear(0,1,40)").learn(2 * LENGTH)
     assert model.cloned
+
+
+def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):
+    with pytest.warns(UserWarning, match=r"No dataset: .*model.prior .*dataset=.*guidance=0"):
+        assert agent(DotEnv()).learn(LENGTH).prior is None
+    recwarn.clear()
+    agent(DotEnv(), offline_ratio=0, guidance=0).learn(LENGTH)
+    agent(DotEnv(), dataset=store).learn(LENGTH)
+    assert not [warning for warning in recwarn if "No dataset" in str(warning.message)]
 
 
 def test_a_seed_that_was_set_is_saved(tmp_path):

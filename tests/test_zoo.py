@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -15,15 +14,17 @@ from run_folders import make_run
 from scipy import stats
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from wpt_envs.tasks import TASKS, Task
+from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo import __main__ as command_line
-from wpt_agents.zoo import benchmark, report, stages
+from wpt_agents.zoo import benchmark, stages
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate
 from wpt_agents.zoo.plan import METHODS, Run, make_plan
 from wpt_agents.zoo.presets import Preset
+from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.statistics import mean_interval
 
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
@@ -48,7 +49,7 @@ SECTIONS = {
 }
 
 
-def make_dot(action_repeat, rendering, render_size=None, render_mode="rgb_array"):
+def make_dot(action_repeat=1, rendering="fast", render_size=None, render_mode="rgb_array"):
     return toy_env.DotEnv(render_mode)
 
 
@@ -71,7 +72,7 @@ def test_a_run_leaves_everything_in_one_folder(tmp_path):
     result = run(one)
     names = {path.name for path in one.folder.iterdir()}
     logs = {"0.monitor.csv", "progress.csv", "evaluations.npz", "system.json", "command.txt"}
-    pictures = {"learning_curve.png", "policy.mp4", "predictions.png"}
+    pictures = {"learning_curve.png", "policy.mp4", "predictions.png", "retrieval.png"}
     assert logs | pictures | {"config.yaml", "model.zip", "result.json"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
     assert list(result["scores"]) == ["nothing", "random", "prior actor", "WPT"]
@@ -95,6 +96,8 @@ def test_every_method_runs(tmp_path, method):
     guided = method not in ("scratch", "pretrain-only", "no-guidance")
     assert ("prior actor" in result["scores"]) == guided
     assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
+    retrieved = (job(tmp_path, method).folder / "retrieval.png").exists()
+    assert retrieved == (method not in ("scratch", "pretrain-only"))
 
 
 def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
@@ -222,7 +225,7 @@ def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
     for seed, mean in enumerate((700.0, 710.0, 720.0)):
         (tmp_path / str(seed)).mkdir()
         (tmp_path / str(seed) / "result.json").write_text(json.dumps(fake_result(seed, mean)))
-    (row,) = report.summarise(report.read_results(tmp_path))
+    (row,) = tables.summarise(read_results(tmp_path))
     # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
     assert (row.seeds, row.mean, row.paper) == (3, 710, 728.0)
     assert (row.low, row.high) == pytest.approx((685.2, 734.8), abs=0.1)
@@ -230,7 +233,7 @@ def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
 
 def test_the_report_keeps_methods_and_budgets_apart():
     other = fake_result(0, 1.0) | {"frames": 1}
-    rows = report.summarise([fake_result(0, 1.0), fake_result(0, 2.0, "scratch"), other])
+    rows = tables.summarise([fake_result(0, 1.0), fake_result(0, 2.0, "scratch"), other])
     assert [(row.method, row.frames) for row in rows] == [
         ("scratch", 150_000),
         ("wpt", 1),
@@ -239,18 +242,18 @@ def test_the_report_keeps_methods_and_budgets_apart():
 
 
 def test_the_report_prints_as_table_and_as_markdown(capsys):
-    rows = report.summarise([fake_result(0, 1.234), fake_result(0, 456.7, "scratch")])
-    Console(width=200).print(report.summary_table(rows))
+    rows = tables.summarise([fake_result(0, 1.234), fake_result(0, 456.7, "scratch")])
+    Console(width=200).print(tables.summary_table(rows))
     printed = capsys.readouterr().out
-    for text in (printed, report.markdown(rows)):
+    for text in (printed, tables.markdown(rows)):
         assert "1.23" in text
         assert "457" in text
-    assert report.markdown(rows).count("\n") == 4
+    assert tables.markdown(rows).count("\n") == 4
 
 
 def test_every_policy_has_its_seeds_and_three_intervals():
     results = [fake_result(seed, mean) for seed, mean in enumerate((700.0, 710.0, 720.0))]
-    (row,) = report.policies(results)
+    (row,) = tables.policies(results)
     assert (row.policy, row.seeds, row.means, row.mean) == ("WPT", (0, 1, 2), (700, 710, 720), 710)
     # six episodes, each 10 from its seed's mean: sd of the mean 10 / sqrt(6) = 4.1, extremes 700
     assert 700 <= row.episodes_low < 705 and 715 < row.episodes_high <= 720
@@ -264,33 +267,25 @@ def test_untrained_policies_are_told_once_however_many_methods_met_them():
     results = [fake_result(0, 5.0, method) for method in ("wpt", "scratch")]
     for result in results:
         result["scores"] = {"nothing": fake_result(0, 1.0)["scores"]["WPT"]} | result["scores"]
-    rows = report.policies(results)
+    rows = tables.policies(results)
     assert [(row.method, row.policy) for row in rows] == [
         ("", "nothing"),
         ("scratch", "WPT"),
         ("wpt", "WPT"),
     ]
     assert rows[0].seeds_low is None  # one seed
-    told = report.policy_markdown(rows)
+    told = tables.policy_markdown(rows)
     assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in told
     assert "| WPT, scratch | 5.0 |" in told
     assert "Seeds 0, 2 episodes each; commit abc." in told
 
 
 def test_the_csv_reads_back_unrounded():
-    rows = report.policies([fake_result(seed, 1 / 3 + seed) for seed in (0, 4)])
-    (read,) = csv.DictReader(io.StringIO(report.policy_csv(rows)))
+    rows = tables.policies([fake_result(seed, 1 / 3 + seed) for seed in (0, 4)])
+    (read,) = csv.DictReader(io.StringIO(tables.policy_csv(rows)))
     assert read["means"] == f"{rows[0].means[0]} {rows[0].means[1]}" and read["seeds"] == "0 4"
     assert float(read["mean"]) == rows[0].mean
     assert read["success"] == ""
-
-
-def call(monkeypatch, *words):
-    """What `python -m wpt_agents.zoo WORDS` ends with: its exit code."""
-    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
-    with pytest.raises(SystemExit) as end:
-        command_line.main()
-    return end.value.code
 
 
 @pytest.mark.parametrize(
@@ -309,6 +304,13 @@ def call(monkeypatch, *words):
         (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
         (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),
         (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+        (["collect", "--out", "data", "--behaviour", "icn"], "Did you mean 'icm'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gama=1"], "mean 'gamma'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma is a"),
+        (["run", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
+        (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
+        (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),
+        (["pretrain", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
     ],
 )
 def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
@@ -316,9 +318,9 @@ def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
 ):
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, *words) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert "Traceback" not in told
+    told = capsys.readouterr()
+    assert message in told.err
+    assert "Traceback" not in told.err and told.out == ""  # refused before anything is begun
     assert list(tmp_path.iterdir()) == []
 
 
@@ -344,8 +346,22 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_pa
     assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
     told = capsys.readouterr().out
     assert told.count("dmc-cheetah-run-back ") == 2
-    assert "4 episodes to collect" in told
+    assert "4 episodes to collect" in told and "of 4 runs to do" in told
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
+    assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
+    told = capsys.readouterr()
+    assert "1 of 1 run to do" in told.out and "--device cuda:99" in told.err
+
+
+def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
+    assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0
+    told = capsys.readouterr().out
+    assert "embodiment" in told and "Dataset:" in told and "{" not in told
 
 
 def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
@@ -368,7 +384,7 @@ def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp
     make_run(tmp_path / "a", "dmc-dot")
     make_run(tmp_path / "b", "dmc-dot")
     with pytest.raises(ValueError, match="are the same run: report one of their folders"):
-        report.read_results(tmp_path)
+        read_results(tmp_path)
 
 
 def test_runs_of_a_changed_preset_are_told_apart(tmp_path):

@@ -1,5 +1,4 @@
 import json
-import sys
 import zlib
 from collections import Counter
 
@@ -8,10 +7,10 @@ import numpy as np
 import pytest
 from debug_agent import SETTINGS, agent
 from stable_baselines3 import SAC
+from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.exploration import EXPLORE, Plan2Explore
-from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import collect as module
 from wpt_agents.zoo.behaviours import COLOURS, coloured_noise, noise_actions
 from wpt_agents.zoo.collect import collect, record
@@ -335,11 +334,6 @@ def test_a_curious_agent_killed_while_its_folder_is_made_goes_on(tmp_path):
 
 
 # The paper's split
-
-
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
-    command_line.main()
 
 
 def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypatch):

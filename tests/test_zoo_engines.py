@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
-from test_zoo import call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
 
 from wpt_agents.zoo import engines, stages
 from wpt_agents.zoo.engines import Local, Ray, Resources, Slurm, run_on
@@ -88,8 +89,9 @@ def test_an_engine_that_is_not_installed_is_told_before_any_work(
 ):
     monkeypatch.setitem(sys.modules, module, None)  # what a missing module looks like
     words = ["run", "--tasks", "dot", "--preset", "debug", "--engine", engine]
-    assert call(monkeypatch, *words, "--out", tmp_path / "runs") == 2
-    assert f'pip install "wpt-agents[{engine}]"' in capsys.readouterr().err
+    for also in ([], ["--dry-run"]):
+        assert call(monkeypatch, *words, *also, "--out", tmp_path / "runs") == 2
+        assert f'pip install "wpt-agents[{engine}]"' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

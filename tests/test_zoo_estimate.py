@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 from run_folders import make_run
-from test_zoo import call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
 
 from wpt_agents.zoo.estimate import check_space, disk_needed, gigabytes, hours_needed, summary
 

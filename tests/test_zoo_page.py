@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from run_folders import make_run
 
-from wpt_agents.zoo import aggregates, figures
-from wpt_agents.zoo.aggregates import misprint, references
-from wpt_agents.zoo.page import write_page
+from wpt_agents.zoo.report import aggregates, figures
+from wpt_agents.zoo.report.aggregates import misprint, references
+from wpt_agents.zoo.report.page import write_page
 
 
 @pytest.fixture
@@ -85,6 +85,28 @@ def test_our_numbers_stand_beside_the_papers(page):
     assert "Table 5: DMControl, return" in page and "Table 4" in page
 
 
+def test_tasks_that_were_not_run_are_folded_away(page):
+    section = re.search(r'<section id="table-5">.*?</section>', page, re.S)[0]
+    shown, folded = section.split("<details")
+    rows = re.findall(r"<tr[^>]*><td>(.*?)</td>", shown)
+    assert rows == ["walker-run", "mean", "median"]
+    assert "21 more tasks of the paper, not run here" in folded and "acrobot-swingup" in folded
+    assert "ours" not in folded  # no column of dashes
+
+
+def test_one_seed_has_no_interval_and_the_page_says_so(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", 0, "wpt", (700.0, 760.0))
+    make_run(tmp_path, "dmc-walker-run", 0, "scratch", (90.0, 110.0))
+    write_page(tmp_path, tmp_path / "index.html")
+    told = text((tmp_path / "index.html").read_text())
+    assert "0.73 to 0.73" not in told
+    assert "1 of 22 1 0.73 no interval 0.73 no interval" in told
+    assert "scratch 1.00 no interval 1" in told  # probability of improvement
+    assert "730 one seed: no interval 1,000 frames seeds 0" in told
+    assert "One seed a task: no interval over seeds" in told
+    assert "No run of the method" not in told
+
+
 def test_misprints_of_the_paper_are_marked_with_what_the_rows_give(page):
     mean = text(re.search(r'<tr class="aggregate"><td>mean</td>.*?</tr>', page, re.S)[0])
     assert "0.90* rows give 0.656" in mean
@@ -116,7 +138,8 @@ def test_every_run_shows_its_command_seed_commit_and_the_first_its_pictures(page
     assert "python -m wpt_agents.zoo run --tasks dmc-walker-run" in card
     assert "seed 1" in card and "0123456789ab" in card
     assert page.count("<video") == 2  # one a task
-    assert page.count("data:image/jpeg;base64,") == 2
+    assert page.count("data:image/jpeg;base64,") == 4  # predictions and what was retrieved
+    assert page.count("what was retrieved") == 2
 
 
 @pytest.mark.parametrize(("media", "videos"), [("all", 6), ("none", 0)])

@@ -1,7 +1,5 @@
 """A look at the data: the table's numbers, and that the pictures show what they say."""
 
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,20 +7,11 @@ from debug_agent import agent, recorded
 from PIL import Image
 from toy_env import DotEnv
 from wpt_envs.tasks import find
+from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import sheets
-
-
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
-    try:
-        command_line.main()
-    except SystemExit as stopped:
-        return stopped.code
-    return 0
 
 
 @pytest.fixture
@@ -89,7 +78,7 @@ def test_a_search_leaves_the_query_out_and_keeps_to_its_robot_if_told_to(dataset
 
 
 def test_a_task_is_searched_for_by_its_first_image():
-    query = sheets.query_at(find("metaworld", "reach"), "fast")
+    query = sheets.query_at(find("metaworld", "reach"), {"rendering": "fast"})
     env = gym.make("wpt/metaworld-reach-v0", rendering="fast")
     np.testing.assert_array_equal(query.image, env.reset(seed=0)[0])
     assert (query.embodiment, query.action_dim) == ("sawyer", 4)
@@ -105,3 +94,21 @@ def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, mon
     assert (30, 30, 30) not in shown  # no dot
     assert call(monkeypatch, "retrieve", "show", *words) == 0
     assert (30, 30, 30) in colours(tmp_path / "found.png")
+
+
+def test_datasets_are_checked_and_joined_from_a_terminal(tmp_path, monkeypatch, capsys):
+    for name in ("one", "two"):
+        with TrajectoryDataset.create(tmp_path / name) as dataset:
+            dataset.extend(recorded(seed=i, embodiment=name) for i in range(2))
+    both = tmp_path / "both"
+    assert not call(monkeypatch, "data", "merge", both, tmp_path / "one", tmp_path / "two")
+    assert TrajectoryDataset.open(both).embodiments == ["one", "one", "two", "two"]
+    assert not call(monkeypatch, "data", "validate", both)
+    assert "4 trajectories read, 0 damaged" in capsys.readouterr().out
+    shard = next(both.glob("shard-*.bin"))
+    shard.write_bytes(shard.read_bytes()[:-50])  # the last trajectory's end
+    assert call(monkeypatch, "data", "validate", both) == 1
+    told = capsys.readouterr().out
+    assert "trajectory 3" in told and "4 trajectories read, 1 damaged" in told
+    assert not call(monkeypatch, "data", "validate", both, "--set-aside")
+    assert len(TrajectoryDataset.open(both)) == 3

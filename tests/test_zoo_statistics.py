@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from run_folders import make_run
 
-from wpt_agents.zoo import report
+from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report.aggregates import estimate
+from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.statistics import (
     bootstrap,
     iqm,
@@ -51,6 +53,11 @@ def test_resampling_never_mixes_strata_and_strata_may_differ_in_length():
     drawn = resample([np.array([1.0, 2.0]), np.array([5.0, 6.0, 7.0])], 100, rng())
     assert [d.shape for d in drawn] == [(100, 2), (100, 3)]
     assert set(drawn[0].ravel()) == {1, 2} and set(drawn[1].ravel()) == {5, 6, 7}
+
+
+def test_an_estimate_has_no_interval_where_a_task_has_one_run():
+    assert estimate(mean, TASKS)[1] is not None
+    assert estimate(mean, [*TASKS, np.array([0.3])]) == (pytest.approx(2.7 / 4), None, None)
 
 
 def rng():
@@ -128,12 +135,12 @@ def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart(tmp
     def row(name, *means):
         for seed, value in enumerate(means):
             make_run(tmp_path / name, "dmc-dot", seed, returns=(value, value))
-        rows = report.policies(report.read_results(tmp_path / name))
+        rows = tables.policies(read_results(tmp_path / name))
         return next(r for r in rows if (r.method, r.policy) == ("wpt", "WPT"))
 
     high, low, wide, single = (
         row(*given) for given in (("a", 9, 10, 11), ("b", 1, 2, 3), ("c", 0, 2, 10), ("d", 1))
     )
-    assert report.above(high, low) and not report.above(low, high)
-    assert not report.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
-    assert not report.above(high, single) and not report.above(single, low)
+    assert tables.above(high, low) and not tables.above(low, high)
+    assert not tables.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
+    assert not tables.above(high, single) and not tables.above(single, low)

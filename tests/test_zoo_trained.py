@@ -10,7 +10,8 @@ import yaml
 from hub_stand_in import hub  # noqa: F401  (a fixture)
 from imageio_ffmpeg import count_frames_and_secs
 from run_folders import make_run
-from test_zoo import DOT, SECTIONS, call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
 
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.hub import card, pull, push

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 from stable_baselines3.common.results_plotter import load_results, plot_results, ts2xy
-from test_zoo import call, dot, job  # noqa: F401  (dot registers the task for each test)
+from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
 
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.stages import locked

@@ -301,11 +301,13 @@ class TrajectoryDataset(Conversions):
         length: int,
         action_width: int | None = None,
         rng: np.random.Generator | None = None,
+        share: slice = slice(None),
     ) -> Batch:
         """Windows drawn by the rule of `wpt_agents.windows`; nothing but `rng` decides which.
 
         :param action_width: how wide the batch's actions are; `max_action_dim` when not given
         :param rng: other windows at every call when not given
+        :param share: which of the windows drawn are read
         :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
             `action_width`
         """
@@ -313,7 +315,7 @@ class TrajectoryDataset(Conversions):
             raise ValueError(f"{self.path} holds no trajectory; append some before sampling")
         if self._windows is None:
             self._windows = Windows(self.lengths)
-        rows = self._windows.draw(batch_size, length, rng or np.random.default_rng())
+        rows = self._windows.draw(batch_size, length, rng or np.random.default_rng())[share]
         action_width = self.max_action_dim if action_width is None else action_width
         shape = (self.image_size, self.image_size, 3)
         return make_batch(rows, self._read, shape, action_width, self._each)
@@ -328,17 +330,19 @@ class TrajectoryDataset(Conversions):
         start: int = 0,
         ahead: int = 2,
         pin: bool = False,
+        share: slice = slice(None),
     ) -> Generator[Batch, None, None]:
         """Batches without end, from number `start`; batch k depends on (seed, rank, k) alone.
 
-        :param rank: another for each process, or purpose, that shares the seed
+        :param rank: another for each purpose that shares the seed
         :param ahead: how many are prepared in the background
         :param pin: put them into pinned memory, from which a GPU copies while it computes
+        :param share: which of each batch's rows are read, for one of several processes
         """
 
         def draw(k: int) -> Batch:
             rng = np.random.default_rng([seed, rank, k])
-            batch = self.sample(batch_size, length, action_width, rng)
+            batch = self.sample(batch_size, length, action_width, rng, share)
             return batch.pin() if pin else batch
 
         with ThreadPoolExecutor(1, "batches") as pool:

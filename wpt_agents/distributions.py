@@ -9,6 +9,29 @@ BINS = 255  # of the two-hot heads, evenly spaced over [-20, 20] in symlog space
 SQRT2 = math.sqrt(2.0)
 
 
+class Share(Generator):
+    """A generator for some of a batch's rows: each row gets what it would get in the whole batch.
+
+    :param rows: of the whole batch
+    :param first: which of them the first row here is
+    """
+
+    def __new__(cls, device: torch.device | str, rows: int, first: int) -> "Share":
+        """Torch's generators take their device here."""
+        return super().__new__(cls, device)
+
+    def __init__(self, device: torch.device | str, rows: int, first: int) -> None:
+        self.rows, self.first = rows, first
+
+
+def exponential(like: Tensor, generator: Generator | None = None) -> Tensor:
+    """Draws of Exp(1), in the shape of `like`: (N, ...)."""
+    if not isinstance(generator, Share):
+        return torch.empty_like(like).exponential_(generator=generator)
+    whole = like.new_empty(generator.rows, *like.shape[1:]).exponential_(generator=generator)
+    return whole[generator.first : generator.first + len(like)]
+
+
 def symlog(x: Tensor) -> Tensor:
     """sign(x) ln(|x| + 1): squeezes rewards and returns of any scale."""
     return torch.sign(x) * torch.log1p(x.abs())
@@ -68,7 +91,7 @@ def sample_one_hot(logits: Tensor, generator: Generator | None = None) -> Tensor
     """
     probs = logits.exp()
     # the largest of p_k / E_k, E_k ~ Exp(1), is class k with probability p_k
-    race = torch.empty_like(probs).exponential_(generator=generator)
+    race = exponential(probs, generator)
     return _straight_through(probs, (probs.detach() / race).argmax(-1))
 
 

@@ -98,10 +98,12 @@ def read_meta(path: Path) -> Meta:
     try:
         meta = json.loads((path / "meta.json").read_text())
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError) as error:
-        what = "is not a dataset" if path.exists() else "does not exist"
+        state = f"damaged ({error})" if isinstance(error, json.JSONDecodeError) else "missing"
+        what = f"is not a dataset: meta.json is {state}" if path.exists() else "does not exist"
         raise ValueError(
-            f"{path} {what} ({error}); make one with TrajectoryDataset.create"
-        ) from error
+            f"{path} {what}. A dataset is a folder made by TrajectoryDataset.create, or by "
+            "`python -m wpt_agents.zoo collect` or `import`"
+        ) from None
     if not isinstance(meta, dict) or meta.get("kind") != KIND:
         raise ValueError(f"{path} is not a dataset: meta.json does not say {KIND!r}")
     if meta["version"] > VERSION:

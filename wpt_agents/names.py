@@ -1,4 +1,4 @@
-"""Errors for names that do not exist: they list the nearest that do."""
+"""Words for people: errors for names that do not exist, and nouns with their number."""
 
 import difflib
 from collections.abc import Iterable
@@ -10,3 +10,8 @@ def unknown_name(kind: str, name: str, valid: Iterable[str]) -> ValueError:
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     return ValueError(f"No {kind} {name!r}. {hint}There are: {', '.join(names)}")
+
+
+def counted(number: int, noun: str) -> str:
+    """'1 task', '2,000 tasks'."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -137,6 +137,17 @@ class Retriever:
         order = np.lexsort((indices, squared))[:k]  # equally near: in the dataset's order
         return indices[order], np.sqrt(squared[order])
 
+    def draw(
+        self,
+        k: int,
+        rng: np.random.Generator,
+        embodiment: str | None = None,
+        action_dim: int | None = None,
+    ) -> np.ndarray:
+        """What `search` chooses from, chosen blindly: `k` indices, each trajectory once."""
+        candidates = self._candidates(embodiment, action_dim)
+        return rng.permutation(candidates)[:k]
+
     def own_share(self, k: int = 10, queries: int = 100) -> float | None:
         """How well the features tell robots apart, without their names or widths to help.
 

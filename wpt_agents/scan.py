@@ -13,6 +13,7 @@ import torch
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
+from wpt_agents.distributions import exponential
 from wpt_agents.networks import NORM_EPS
 
 aten = torch.ops.aten
@@ -237,8 +238,7 @@ class FilterScan(torch.autograd.Function):
             if reset:
                 deter, stoch = deter * keep[t, :, None], stoch * keep[t, :, None, None]
             deter, probs = steps.forward(deter, stoch, action_half[t], embed_half[t])
-            race = torch.empty_like(probs).exponential_(generator=generator)
-            index = (probs / race).argmax(-1, keepdim=True)
+            index = (probs / exponential(probs, generator)).argmax(-1, keepdim=True)
             stoch = torch.zeros_like(probs).scatter_(-1, index, 1.0)
             deters.append(deter)
             stochs.append(stoch)

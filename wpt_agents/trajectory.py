@@ -26,7 +26,7 @@ IMAGE_SIZE = 64
 STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """One episode. Action t was taken at image t, brought reward t and led to image t + 1.
 
@@ -79,6 +79,12 @@ class Trajectory:
         """The number of actions, T."""
         return len(self.action)
 
+    def __repr__(self) -> str:
+        """What it is of, without its pixels."""
+        names = f"embodiment={self.embodiment!r}, task={self.task!r}"
+        rewards = "known" if self.reward is not None else None
+        return f"Trajectory(T={len(self)}, {names}, action_dim={self.action_dim}, reward={rewards})"
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -109,6 +115,13 @@ class Batch:
         return Batch(
             **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)}
         )
+
+    def split(self, parts: int) -> list["Batch"]:
+        """Its rows in order, in `parts` batches of as many rows each."""
+        rows, left = divmod(len(self.image), parts)
+        assert left == 0, (len(self.image), parts)
+        streams = {f.name: getattr(self, f.name).split(rows) for f in fields(self)}
+        return [Batch(**{k: each[i] for k, each in streams.items()}) for i in range(parts)]
 
     def pin(self) -> "Batch":
         """The same batch in pinned memory."""

@@ -4,6 +4,7 @@
 """
 
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,9 +25,9 @@ from wpt_agents.policy import Dream, WPTPolicy
 from wpt_agents.replay import ReplayBuffer, mix
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Batch
-from wpt_agents.world_model import reward_loss, world_model_update_loss
+from wpt_agents.world_model import WorldModelLoss, reward_loss, world_model_update_loss
 
-PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT = range(6)  # purposes of random streams
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE = range(7)  # purposes of random streams
 
 
 class Updates:
@@ -100,15 +101,7 @@ class Updates:
         """Eq. (1), and the reward likelihood on states cut off from the world model."""
         model = self.policy.world_model
         with self._autocast():
-            loss, post = world_model_update_loss(
-                model,
-                batch,
-                generator,
-                dyn_scale=self.dyn_scale,
-                rep_scale=self.rep_scale,
-                free_nats=self.free_nats,
-                free_nats_mode=self.free_nats_mode,
-            )
+            loss, post = world_model_update_loss(model, batch, generator, **self._eq_1_options)
             total = loss.total
             if learn_reward:
                 logits = model.reward_head(post.feat.detach())
@@ -116,10 +109,13 @@ class Updates:
                 total = total + reward
                 metrics["train/reward_loss"].append(reward.detach())
         norm = self._descend(self.model_optimizer, total, "world model")
-        metrics["train/reconstruction_loss"].append(loss.reconstruction.detach())
-        metrics["train/kl"].append(loss.kl)
-        metrics["train/world_model_grad_norm"].append(norm)
+        note(metrics, loss, norm)
         return post.detach()
+
+    @property
+    def _eq_1_options(self) -> dict[str, Any]:
+        names = "dyn_scale", "rep_scale", "free_nats", "free_nats_mode"
+        return {name: getattr(self, name) for name in names}
 
     def _update_behavior(
         self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
@@ -170,6 +166,10 @@ class Updates:
         """
         optimizer.zero_grad()
         loss.backward()
+        return self._step(optimizer, loss, name)
+
+    def _step(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """What `_descend` does once the gradients of `loss` are there."""
         groups = [group["params"] for group in optimizer.param_groups]
         norms = [clip_grad_norm_(weights, self.grad_clip) for weights in groups]
         if not torch.isfinite(sum(norms) + loss.detach()):
@@ -195,6 +195,13 @@ class Updates:
     def _generator(self, purpose: int, counter: int) -> Generator:
         seed = torch_seed(self._stream(purpose, counter))
         return Generator(self.device).manual_seed(seed)
+
+
+def note(metrics: dict[str, list[Tensor]], loss: WorldModelLoss, norm: Tensor) -> None:
+    """Appends what a step on Eq. (1) has to tell."""
+    metrics["train/reconstruction_loss"].append(loss.reconstruction.detach())
+    metrics["train/kl"].append(loss.kl)
+    metrics["train/world_model_grad_norm"].append(norm)
 
 
 def torch_seed(rng: np.random.Generator) -> int:

@@ -1,6 +1,7 @@
 """The world model and its losses: Eq. (1) world_model_loss, and reward_loss of A.3."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,6 +31,7 @@ def world_model_loss(
     rep_scale: float = 0.1,
     free_nats: float = 1.0,
     free_nats_mode: str = "mean",
+    whole: Callable[[Tensor], Tensor] | None = None,
 ) -> WorldModelLoss:
     """Eq. (1): -ln p(o_t | z_t, h_t) + beta KL(q(z_t | h_t, o_t) || p(z_t | h_t)).
 
@@ -43,6 +45,8 @@ def world_model_loss(
     :param prior_logits: (B, T, S, K) log-probabilities of p
     :param free_nats_mode: clip the mean over the batch ("mean", as WPT) or each element ("element",
         as DreamerV3)
+    :param whole: where this is a share of a batch, what turns its mean KL into the whole batch's,
+        whose clip "mean" means
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
     assert post_logits.shape == prior_logits.shape, (post_logits.shape, prior_logits.shape)
@@ -53,6 +57,9 @@ def world_model_loss(
         raise unknown_name("free_nats_mode", free_nats_mode, ("mean", "element"))
     if free_nats_mode == "mean":
         dyn, rep = dyn.mean(), rep.mean()
+        if whole is not None:  # the value of the whole, the gradient of the share
+            others = whole(dyn.detach()) - dyn.detach()
+            dyn, rep = dyn + others, rep + others
     kl = dyn.mean().detach()
     dyn, rep = dyn.clamp_min(free_nats).mean(), rep.clamp_min(free_nats).mean()
     return WorldModelLoss(error + dyn_scale * dyn + rep_scale * rep, error, kl)
@@ -132,7 +139,7 @@ class WorldModel(nn.Module):
 
 
 def world_model_update_loss(
-    model: WorldModel, batch: Batch, generator: Generator | None = None, **options: float | str
+    model: WorldModel, batch: Batch, generator: Generator | None = None, **options: Any
 ) -> tuple[WorldModelLoss, Latent]:
     """Eq. (1) on a batch, and the posterior states it went through.
 

@@ -9,15 +9,12 @@ Example::
 """
 
 import inspect
-import os
 import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Collection
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,21 +34,23 @@ from wpt_agents.checks import check_dataset, check_hyperparameters, check_reward
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.importers.convert import Data
-from wpt_agents.model_file import read_model
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
+from wpt_agents.pretraining import Pretraining
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout, clone_guide, last_images, random_guide, step_all
-from wpt_agents.saving import Saving
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.updates import ACT, CLONE, PRETRAIN, WARMUP, WINDOW, Updates, torch_seed
+from wpt_agents.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
-EVERY = 1000  # pre-training steps between checkpoints
+NO_DATASET = (
+    "No dataset: nothing is rehearsed, no prior actor guides, and model.prior stays None. Give "
+    "dataset= to WPT or load, or say offline_ratio=0, guidance=0 if you mean it"
+)
 
 
-class WPT(Updates, Saving, BaseAlgorithm):
+class WPT(Pretraining, BaseAlgorithm):
     """Generalist world-model pre-training and fine-tuning, in Stable-Baselines3's words.
 
     Example::
@@ -60,7 +59,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         model.set_env("wpt/dmc-walker-run-v0")
         model.learn(75_000).save("walker.zip")
 
-    Without pre-training and dataset, `WPT("WPTPolicy", env)` learns from scratch. The defaults are
+    `WPT("WPTPolicy", env, offline_ratio=0, guidance=0)` learns from scratch. The defaults are
     Table 2 of the paper; steps are calls of `env.step` (2 frames each at action repeat 2).
 
     :param policy: "WPTPolicy"
@@ -95,6 +94,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
     :param guidance: schedule of the probability that an episode is guided; 0: none
     :param episode_length: steps of an episode, for the guidance window; found out if None
     :param num_retrieve: R, trajectories to retrieve
+    :param retrieval: "nearest", by Eq. (5), or "random", its ablation
     :param bc_steps: updates of the prior actor
     :param bc_batch_size: pairs in each
     :param bc_learning_rate: of the prior actor
@@ -143,6 +143,7 @@ class WPT(Updates, Saving, BaseAlgorithm):
         guidance: str | float = "linear(1,0,50000)",
         episode_length: int | None = None,
         num_retrieve: int = 500,
+        retrieval: str = "nearest",
         bc_steps: int = 150_000,
         bc_batch_size: int = 256,
         bc_learning_rate: float = 1e-4,
@@ -267,73 +268,6 @@ class WPT(Updates, Saving, BaseAlgorithm):
         self.policy.reset_behavior()
         self._setup_optimizers()
 
-    # ------------------------------------------------- // Task-Agnostic World Model Pre-Training
-
-    @classmethod
-    def pretrain(
-        cls,
-        dataset: Data,
-        env: GymEnv | str | None = None,
-        steps: int = 200_000,
-        size: str = "paper",
-        run_dir: str | os.PathLike[str] | None = None,
-        seed: int | None = None,
-        progress_bar: bool = False,
-        callback: Callable[[int, dict[str, float]], Any] | None = None,
-        **kwargs: Any,
-    ) -> "WPT":
-        """Trains a world model on reward-free trajectories of any embodiments, by Eq. (1).
-
-        :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
-            whatever `TrajectoryDataset.of` takes
-        :param env: the environment to go on with, if known
-        :param steps: updates
-        :param run_dir: `model.zip` is written there every 1000 steps and at the end; if it is
-            there already, training goes on from it
-        :param callback: called after every update with (step, metrics)
-        :param kwargs: keywords of `WPT`
-        :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
-            with other images or wider actions; an unknown keyword
-        """
-        cls._check_keywords(kwargs)
-        model = cls(size=size, seed=seed, **kwargs)
-        model.set_dataset(dataset)
-        path = Path(run_dir) / "model.zip" if run_dir is not None else None
-        if path is not None and path.exists():
-            model._take(*read_model(path), ("size", "max_action_dim", "batch_size", "batch_length"))
-        model._pretrain(steps, path, progress_bar, callback)
-        if env is not None:
-            model.set_env(env)
-        return model
-
-    def _pretrain(
-        self,
-        steps: int,
-        path: Path | None,
-        progress_bar: bool,
-        callback: Callable[[int, dict[str, float]], Any] | None,
-    ) -> None:
-        assert self.dataset is not None
-        done = self.pretrain_steps
-        shape = self.batch_size, self.batch_length, self.max_action_dim
-        pin = self.device.type == "cuda"
-        batches = self.dataset.batches(*shape, self.stream_seed, PRETRAIN, start=done, pin=pin)
-        bar = tqdm(total=steps, initial=done, desc="pre-train", disable=not progress_bar)
-        with bar, closing(batches):
-            for step, batch in zip(range(done, steps), batches, strict=False):
-                metrics: dict[str, list[Tensor]] = defaultdict(list)
-                generator = self._generator(PRETRAIN, step)
-                self._update_world_model(batch.to(self.device), metrics, generator)
-                self.pretrain_steps = step + 1
-                if callback is not None:
-                    callback(self.pretrain_steps, {k: float(v[0]) for k, v in metrics.items()})
-                if step % 20 == 0:
-                    loss = float(metrics["train/reconstruction_loss"][0])
-                    bar.set_postfix(reconstruction=f"{loss:.1f}")
-                bar.update()
-                if path is not None and ((step + 1) % EVERY == 0 or step + 1 == steps):
-                    self.save(path)
-
     # ----------------------------------------------------------------- // Task-Specific Training
 
     def learn(
@@ -377,6 +311,8 @@ class WPT(Updates, Saving, BaseAlgorithm):
         if self.dataset is None and self.retrieved_ids and self.offline_ratio:
             warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
         wanted = self._guided() or self.offline_ratio
+        if self.dataset is None and wanted and not self.retrieved_ids:
+            warnings.warn(NO_DATASET, stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not wanted:
             return
         if not self.retrieved_ids or self.retrieved_of != self.dataset.fingerprint:
@@ -391,7 +327,10 @@ class WPT(Updates, Saving, BaseAlgorithm):
         assert self.dataset is not None
         width, retriever = self.action_space.shape[0], self.build_index(progress_bar)
         known = self.embodiment if self.embodiment in self.dataset.embodiments else None
-        found, _ = retriever.search(query, self.num_retrieve, known, width)
+        if self.retrieval == "random":
+            found = retriever.draw(self.num_retrieve, self._stream(RETRIEVE, 0), known, width)
+        else:
+            found, _ = retriever.search(query, self.num_retrieve, known, width)
         if len(found) == 0:
             raise ValueError(
                 f"The dataset {self.dataset.path} has no trajectory of {width} actions to "
@@ -533,6 +472,11 @@ class WPT(Updates, Saving, BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
 
-CHOICES = {"size": SIZES, "precision": ("fp32", "bf16"), "free_nats_mode": ("mean", "element")}
+CHOICES: dict[str, Collection[str]] = {
+    "size": SIZES,
+    "precision": ("fp32", "bf16"),
+    "free_nats_mode": ("mean", "element"),
+    "retrieval": ("nearest", "random"),
+}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}

@@ -1,5 +1,7 @@
 """Gymnasium-Robotics: Fetch, the Shadow hand and Adroit, an extra suite of further embodiments."""
 
+from contextlib import redirect_stderr
+from io import StringIO
 from typing import Any, cast
 
 import gymnasium as gym
@@ -12,8 +14,10 @@ from wpt_envs.simulated import Achieved, StepResult
 from wpt_envs.wrappers import dress
 
 # isort: split
-import gymnasium_robotics
 import mujoco
+
+with redirect_stderr(StringIO()):  # a notice about its versions, of which ours is fixed
+    import gymnasium_robotics
 
 _IDS = {
     "fetch-reach": "FetchReach-v4",

@@ -36,6 +36,8 @@ class Hdf5Episodes(Episodes):
         h5py = needs("h5py", "HDF5 files")
         try:
             self._file = h5py.File(file, "r")
+        except FileNotFoundError:
+            raise ValueError(f"{file} does not exist; name an HDF5 file") from None
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
         self._name, self._key = os.fspath(file), image_key

@@ -12,6 +12,7 @@ import typer
 from wpt_agents.zoo import data_commands
 from wpt_agents.zoo.bench.command import bench
 from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.report.command import report
 
 app = typer.Typer(
     add_completion=False,
@@ -74,17 +75,31 @@ def pretrain_model(
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
+    accumulate: Annotated[
+        int, typer.Option(min=1, help="Passes over each batch, to save memory.")
+    ] = 1,
 ) -> None:
     """Pre-trains a preset's world model, on its data or yours; `run` reuses it.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
-    """
-    from wpt_agents.zoo.presets import load_preset
-    from wpt_agents.zoo.stages import Shared
 
+    On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
+    """
+    from wpt_agents.distributed import joined, local_device
+    from wpt_agents.zoo.machine import check_device
+    from wpt_agents.zoo.presets import load_preset
+    from wpt_agents.zoo.stages import Shared, console
+
+    check_device(device)
     chosen = load_preset(suite, preset, settings)
-    shared = Shared(chosen, suite, out / "cache", workers, device, data)
-    typer.echo(f"Model: {shared.model(shared.data()).resolve()}")
+    shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
+    with joined(local_device(device)) as world:
+        console.quiet = world.rank > 0
+        with world.rank_0_first():
+            dataset = shared.data()
+        model = shared.model(dataset).resolve()
+        if world.rank == 0:
+            typer.echo(f"Model: {model}")
 
 
 @app.command("run", cls=Spaced)
@@ -98,8 +113,8 @@ def run_benchmark(
     method: Annotated[
         list[str],
         typer.Option(
-            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain; several "
-            "allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
+            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain, "
+            "random-retrieval; several allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
         ),
     ] = ["wpt"],  # noqa: B006
     frames: Annotated[
@@ -137,22 +152,28 @@ def run_benchmark(
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
+    from wpt_agents.distributed import started_by_torchrun
     from wpt_agents.zoo.benchmark import run_all
     from wpt_agents.zoo.engines import Resources, run_on
     from wpt_agents.zoo.estimate import check_space, summary
+    from wpt_agents.zoo.machine import check_machine
     from wpt_agents.zoo.plan import make_plan, show_plan
     from wpt_agents.zoo.watch import watch as show_standings
 
+    if started_by_torchrun():
+        raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
-    if dry_run:
-        show_plan(jobs, force)
-        typer.echo(summary(jobs))
-        return
     if watch:
         show_standings(jobs)
         return
+    if dry_run:
+        show_plan(jobs, force)
+        typer.echo(summary(jobs))
+    check_machine(engine, device)
     check_space(jobs)
+    if dry_run:
+        return
     if engine == "none":
         done = run_all(jobs, force)
     else:
@@ -184,7 +205,7 @@ def evaluate_model(
 
     Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
     """
-    from wpt_agents.zoo.report import interval_text, number
+    from wpt_agents.zoo.report.tables import interval_text, number
     from wpt_agents.zoo.trained import find_trained
 
     trained = find_trained(run, task)
@@ -212,7 +233,7 @@ def enjoy_model(
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
-    from wpt_agents.zoo.report import number
+    from wpt_agents.zoo.report.tables import number
     from wpt_agents.zoo.trained import find_trained
 
     if size % 16:
@@ -251,49 +272,7 @@ def pull_run(
     typer.echo(f"Pulled: {folder.resolve()}. Watch it: python -m wpt_agents.zoo enjoy {folder}")
 
 
-@app.command("report")
-def report_results(
-    folder: Annotated[Path, typer.Argument(help="Run folders are searched below it.")] = Path(
-        "runs"
-    ),
-    markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
-    csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
-    out: Annotated[
-        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
-    ] = None,
-    media: Annotated[
-        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
-    ] = "first",
-) -> None:
-    """Shows the mean over seeds of every task and method, and writes a page about all runs.
-
-    The page is one file that needs no network: the paper's tables beside yours, aggregates with
-    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
-    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
-    prior actor, WPT.
-    """
-    from wpt_agents.zoo import report
-    from wpt_agents.zoo.page import write_page
-    from wpt_agents.zoo.stages import console
-
-    results = report.read_results(folder)
-    if not results:
-        raise ValueError(f"No finished run below {folder}: there is no result.json.")
-    rows, policies = report.summarise(results), report.policies(results)
-    as_markdown = f"{report.markdown(rows)}\n{report.policy_markdown(policies)}"
-    if csv:
-        typer.echo(report.policy_csv(policies), nl=False)
-    elif markdown:
-        typer.echo(as_markdown, nl=False)
-    else:
-        page = (out or folder / "report") / "index.html"
-        write_page(folder, page, media)
-        page.with_name("report.md").write_text(as_markdown)
-        page.with_name("policies.csv").write_text(report.policy_csv(policies))
-        console.print(report.summary_table(rows))
-        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
-
-
+app.command("report")(report)
 app.command("bench")(bench)
 
 

@@ -26,8 +26,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.names import counted
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo import pictures, report
+from wpt_agents.zoo import pictures, sheets
 from wpt_agents.zoo.checkpoints import (
     LOGS,
     Checkpoint,
@@ -41,6 +42,7 @@ from wpt_agents.zoo.checkpoints import (
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.progress import LearningBar
+from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.stages import BASELINES, console, locked, say, write_json
 from wpt_agents.zoo.tasks import short_name
 
@@ -62,12 +64,12 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
         except Exception as error:  # whatever one run dies of, the others are not to blame
             console.print(f"[red]failed[/red]: {error}\nTraceback: {job.folder / 'error.txt'}")
             continue
-        console.print(report.scores_table(done))
+        console.print(tables.scores_table(done))
         say("took", ", ".join(f"{k} {v:.0f} s" for k, v in done["seconds"].items()))
         console.print(f"Run folder: [bold]{job.folder.resolve()}[/bold]")
     results = [result for job in jobs if (result := job.result())]
     if len(results) > 1:
-        console.print(report.summary_table(report.summarise(results)))
+        console.print(tables.summary_table(tables.summarise(results)))
     return len(results) == len(jobs)
 
 
@@ -160,6 +162,9 @@ def _work(job: Run) -> dict[str, Any]:
         if dataset is not None and checkpoint is None:  # else it has retrieved already
             with clock("index"):
                 job.shared.index(model)
+                if job.retrieves:
+                    picture = job.folder / "retrieval.png"
+                    sheets.sheet_of_run(picture, model, job.task, job.shared.env, job.seed)
         clock.seconds["learn"] = round(_learn(job, model, checkpoint), 1)
         model.save(job.folder / "model.zip")
     with clock("evaluate"):
@@ -250,7 +255,7 @@ def _evaluate(job: Run, model: WPT) -> tuple[WPT, dict[str, Score]]:
     :return: the model that counts, the best in between or the last, and all scores
     """
     episodes, seed = job.preset.evaluate.episodes, job.evaluation_seed
-    say("evaluate", f"{episodes} episodes of each policy, from the same initial states")
+    say("evaluate", f"{counted(episodes, 'episode')} of each policy, from the same initial states")
     scores = {name: job.shared.baseline(name, job.task, seed) for name in BASELINES}
     policies = {"prior actor": model.prior, "WPT": model}
     best = job.folder / "best_model.zip"

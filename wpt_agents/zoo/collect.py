@@ -27,8 +27,9 @@ from gymnasium import spaces
 from tqdm.auto import tqdm
 
 from wpt_agents.archive import replacing
+from wpt_agents.checks import check_hyperparameters
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.exploration import EXPLORERS
+from wpt_agents.exploration import EXPLORE, EXPLORERS
 from wpt_agents.names import unknown_name
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions, scripted_actions
@@ -178,13 +179,15 @@ def collect(
     :param settings: keywords of WPT for a curious agent, beside `exploration.EXPLORE`
     """
     _check(tasks, episodes, behaviour, policy)
+    check_hyperparameters({**EXPLORE, **(settings or {})})
     plan = Plan(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
     told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
     dataset = _open(Path(path), told)
     total, before = len(tasks) * episodes, dataset.appended
-    bar = progress(total, "collect", "episodes", before, hide=not progress_bar or before == total)
+    label, hide = f"collect {behaviour}", not progress_bar or before == total
+    bar = progress(total, label, "episodes", before, hide)
     with bar, dataset:
         if behaviour in EXPLORERS:
             _collect_curious(dataset, tasks, episodes, plan, workers, bar)

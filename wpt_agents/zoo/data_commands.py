@@ -1,4 +1,4 @@
-"""The commands that make data and look at them: collect, import, data show, retrieve show.
+"""The commands that make data and look at them: collect, import, data ..., retrieve show.
 
 Imports stand inside the commands so that `--help` answers at once.
 """
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wpt_agents.zoo.options import Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.options import Rendering, Spaced, Suite, Tasks, Workers
 
 if TYPE_CHECKING:
     from wpt_agents.dataset import TrajectoryDataset
 
-data = typer.Typer(no_args_is_help=True, help="Looks at a dataset.")
+data = typer.Typer(no_args_is_help=True, help="Looks at datasets, checks and joins them.")
 retrieve = typer.Typer(no_args_is_help=True, help="Looks at what retrieval finds.")
 Store = Annotated[Path, typer.Argument(help="A dataset's folder.")]
 Picture = Annotated[Path, typer.Option(help="Where the picture goes.")]
@@ -25,6 +25,8 @@ def register(app: typer.Typer) -> None:
     app.command("collect", cls=Spaced)(collect_data)
     app.command("import")(import_data)
     data.command("show")(show_data)
+    data.command("validate")(validate_data)
+    data.command("merge")(merge_data)
     app.add_typer(data, name="data")
     retrieve.command("show", cls=Spaced)(show_retrieval)
     app.add_typer(retrieve, name="retrieve")
@@ -57,7 +59,7 @@ def collect_data(
         list[str],
         typer.Option("--set", metavar="KEY=VALUE", help="For icm, plan2explore: WPT's keywords."),
     ] = [],  # noqa: B006
-    rendering: Annotated[str, typer.Option(help="exact, near or fast.")] = "near",
+    rendering: Annotated[Rendering, typer.Option(help="Of the pictures.")] = Rendering.near,
 ) -> None:
     """Plays tasks and stores the episodes, without rewards unless asked for.
 
@@ -75,12 +77,11 @@ def collect_data(
     ids = [row.id for row in find_tasks(suite, names)]
     episodes = episodes or (paper.episodes if paper else 30)
     behaviour = behaviour or (paper.behaviour if paper else "noise")
-    typer.echo(f"{len(ids)} tasks x {episodes} episodes, {behaviour}, in {out}")
     dataset = collect(
-        out, ids, episodes, seed, workers, behaviour, {"rendering": rendering},
+        out, ids, episodes, seed, workers, behaviour, {"rendering": str(rendering)},
         rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings),
     )  # fmt: skip
-    _print_info(dataset)
+    _print_summary(dataset)
 
 
 def import_data(
@@ -133,7 +134,7 @@ def import_data(
         warnings.showwarning = _show_warning
         episodes = open_episodes(source, None if form == "auto" else form, **shared, **options)
         dataset = TrajectoryDataset.from_episodes(episodes, out, progress_bar=True)
-    _print_info(dataset)
+    _print_summary(dataset)
 
 
 def _numbers(option: str, text: str | None) -> list[float] | None:
@@ -149,9 +150,13 @@ def _show_warning(message: Warning | str, *_: object) -> None:
     typer.secho(f"Warning: {message}", fg="yellow", err=True)
 
 
-def _print_info(dataset: "TrajectoryDataset") -> None:
-    for name, value in dataset.info().items():
-        typer.echo(f"{name:<16} {value}")
+def _print_summary(dataset: "TrajectoryDataset") -> None:
+    """What the dataset holds, robot by robot, and where it is."""
+    from wpt_agents.zoo.sheets import data_table
+    from wpt_agents.zoo.stages import console
+
+    console.print(data_table(dataset))
+    typer.echo(f"Dataset: {dataset.path.resolve()}")
 
 
 def show_data(
@@ -164,14 +169,51 @@ def show_data(
     Example: `python -m wpt_agents.zoo data show data/two --out two.png`
     """
     from wpt_agents.dataset import TrajectoryDataset
-    from wpt_agents.zoo.sheets import contact_sheet, data_table
-    from wpt_agents.zoo.stages import console
+    from wpt_agents.zoo.sheets import contact_sheet
 
     dataset = TrajectoryDataset.open(folder)
-    console.print(data_table(dataset))
+    _print_summary(dataset)
     if len(dataset):
         contact_sheet(out, dataset, rows)
         typer.echo(f"Contact sheet: {out.resolve()}")
+
+
+def validate_data(
+    folder: Store,
+    set_aside: Annotated[
+        bool, typer.Option("--set-aside", help="Leave the damaged ones out from now on.")
+    ] = False,
+) -> None:
+    """Reads every byte of a dataset and names the trajectories that are damaged.
+
+    Exits with 1 if there are any, unless they are set aside.
+
+    Example: `python -m wpt_agents.zoo data validate data/two`
+    """
+    from wpt_agents.dataset import TrajectoryDataset
+
+    dataset = TrajectoryDataset.open(folder)
+    asked = len(dataset)
+    damaged = dataset.validate(progress_bar=True, set_aside=set_aside)
+    for each in damaged:
+        typer.echo(f"trajectory {each.trajectory}: {each.reason}")
+    state = "set aside" if set_aside else "damaged"
+    typer.echo(f"{asked} trajectories read, {len(damaged)} {state}")
+    if damaged and not set_aside:
+        raise typer.Exit(1)
+
+
+def merge_data(
+    out: Annotated[Path, typer.Argument(metavar="DST", help="The new dataset's folder.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Datasets to join.")],
+) -> None:
+    """Makes a new dataset of all trajectories of others, in their order.
+
+    Example: `python -m wpt_agents.zoo data merge data/all data/noise data/curious`
+    """
+    from wpt_agents.dataset import TrajectoryDataset
+
+    _print_summary(TrajectoryDataset.merge(out, folders))
 
 
 def show_retrieval(
@@ -182,7 +224,7 @@ def show_retrieval(
     ] = [],  # noqa: B006
     task: Annotated[list[str], typer.Option(help="Tasks whose first image to search for.")] = [],  # noqa: B006
     suite: Suite = "dmc",
-    rendering: Annotated[str, typer.Option(help="Of --task: exact, near or fast.")] = "near",
+    rendering: Annotated[Rendering, typer.Option(help="Of --task.")] = Rendering.near,
     number: Annotated[int, typer.Option(min=1, help="How many of the nearest.")] = 8,
     own_robot: Annotated[
         bool, typer.Option("--own-robot", help="Only its robot and action width, as WPT does.")
@@ -203,7 +245,7 @@ def show_retrieval(
     assert agent.dataset is not None
     queries = [sheets.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [sheets.query_at(row, rendering) for row in rows]
+    queries += [sheets.query_at(row, {"rendering": str(rendering)}) for row in rows]
     if not queries:
         chosen = sheets.spread(agent.dataset, 6)
         queries = [sheets.query_of(agent.dataset, i) for i in chosen]

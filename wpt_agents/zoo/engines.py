@@ -5,7 +5,6 @@ goes on from its last checkpoint if its worker died before. The folders are the 
 stand on a file system that all machines see. Ray and submitit are imported only when asked for.
 """
 
-import importlib
 import shutil
 import signal
 import sys
@@ -16,18 +15,17 @@ from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 
-from wpt_agents.names import unknown_name
+from wpt_agents.names import counted
 from wpt_agents.zoo import benchmark
+from wpt_agents.zoo.machine import check_machine, import_extra
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.stages import console, locked, say
 from wpt_agents.zoo.watch import shown
 
-ENGINES = ("local", "ray", "slurm")
 Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called again and again while waiting; takes a moment
 Errors = dict[Path, str]  # by run folder, of the runs that failed
@@ -57,8 +55,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
 
     :return: whether all are finished
     """
-    if engine not in ENGINES:
-        raise unknown_name("engine", engine, ENGINES)
+    check_machine(engine, jobs[0].device)
     jobs = [_at_absolute_paths(job) for job in jobs]
     for job in jobs:
         benchmark.check_folder(job, force)
@@ -69,7 +66,8 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
             benchmark.clear(job.folder)
     by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
     shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
-    say("engine", f"{engine}: {len(left)} of {len(jobs)} runs to do, {given.cpus} CPUs each")
+    runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")
+    say("engine", f"{engine}: {len(left)} of {runs} to do, {cpus} each")
     with shown(jobs) as tick:
         if errors := runner.map(make_shared, list(shared.values()), tick):
             reason = next(iter(errors.values()))
@@ -112,14 +110,6 @@ def logged(path: Path) -> Iterator[None]:
         finally:
             sys.stdout, sys.stderr = before
             console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"
-
-
-def import_extra(name: str, extra: str) -> ModuleType:
-    """The module of an extra, or the line that installs it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ValueError(f'{name} is not installed: pip install "wpt-agents[{extra}]"') from None
 
 
 class Local:

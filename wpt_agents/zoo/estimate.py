@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from wpt_agents.names import counted
 from wpt_agents.zoo.plan import METHODS, Run
-from wpt_agents.zoo.report import read_results
+from wpt_agents.zoo.report.folders import read_results
 
 STORED_STEP, RAW_STEP = 2_500, 12_288  # bytes of an image: in the dataset (lossless), in the replay
 PARAMETERS = {"debug": 0.2e6, "tiny": 0.8e6, "small": 3e6, "medium": 18e6, "paper": 300e6}
@@ -72,6 +73,6 @@ def summary(jobs: Sequence[Run]) -> str:
     )
     updates = sum(job.updates for job in jobs if job.result() is None)
     return (
-        f"{left} of {len(jobs)} runs to do, {updates:,} updates; one after the other: {time}; "
-        f"disk: about {gigabytes(disk_needed(jobs))}"
+        f"{left} of {counted(len(jobs), 'run')} to do, {counted(updates, 'update')}; "
+        f"one after the other: {time}; disk: about {gigabytes(disk_needed(jobs))}"
     )

@@ -123,9 +123,12 @@ def make_vec_env(
     :param monitor: the file of its episodes, which is continued if it is there
     """
     anew = monitor is None or not Path(monitor).exists()
+    row = wpt_envs.TASKS.get(task)
+    told = ("is_success",) if row is not None and row.metric == "success" else ()
 
     def make() -> gym.Env:
-        return Monitor(EpisodeSeeds(gym.make(task, **env)), monitor, override_existing=anew)
+        made = EpisodeSeeds(gym.make(task, **env))
+        return Monitor(made, monitor, info_keywords=told, override_existing=anew)
 
     venv = DummyVecEnv([make] * n_envs)
     venv.seed(seed)

@@ -9,14 +9,16 @@ from typing import Any
 
 import yaml
 
-from wpt_agents.zoo import report
-from wpt_agents.zoo.engines import import_extra
+from wpt_agents.zoo.machine import import_extra
+from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report.aggregates import score_of
 from wpt_agents.zoo.trained import find_trained
 
 # What is shared; logs, replay and checkpoints stay at home.
 FILES = (
     *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json", "command.txt"),
     *("evaluations.npz", "0.monitor.csv", "policy.mp4", "learning_curve.png", "predictions.png"),
+    "retrieval.png",
 )
 VIDEO = "replay.mp4"  # the name that the hub shows a policy's video under
 
@@ -64,7 +66,7 @@ def _check(name: str) -> None:
 def card(folder: Path, name: str) -> str:
     """The model card: metadata that the hub reads, scores of all policies, how to load it."""
     result: dict[str, Any] = json.loads((folder / "result.json").read_text())
-    score = report.score_of(result)
+    score = score_of(result)
     value = {"type": result["metric"], "name": f"mean {result['metric']}", "value": score}
     about = {
         "library_name": "wpt-agents",
@@ -85,8 +87,8 @@ def card(folder: Path, name: str) -> str:
     }
     return _CARD.format(
         about=yaml.safe_dump(about, sort_keys=False),
-        table=report.markdown_table(
-            report.POLICY_HEADINGS, map(report.policy_cells, report.policies([result]))
+        table=tables.markdown_table(
+            tables.POLICY_HEADINGS, map(tables.policy_cells, tables.policies([result]))
         ),
         command=(folder / "command.txt").read_text().strip(),
         name=name,

@@ -1,5 +1,6 @@
 """What several commands share: options, and how they take several values."""
 
+from enum import StrEnum
 from typing import Annotated, Any
 
 import typer
@@ -25,6 +26,7 @@ class Spaced(TyperCommand):
         return super().parse_args(ctx, spread)
 
 
+Rendering = StrEnum("Rendering", ["exact", "near", "fast"])
 Suite = Annotated[str, typer.Option(help="dmc, or another suite of `list`.")]
 Tasks = Annotated[
     list[str],

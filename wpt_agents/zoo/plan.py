@@ -14,7 +14,7 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.checks import check_hyperparameters
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.names import unknown_name
+from wpt_agents.names import counted, unknown_name
 from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
 from wpt_agents.zoo.stages import Shared, console
 from wpt_agents.zoo.tasks import find_tasks, short_name
@@ -41,6 +41,7 @@ METHODS = {
     "no-guidance": Method(wpt={"guidance": 0.0}),
     "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
+    "random-retrieval": Method(wpt={"retrieval": "random"}),
 }
 ABLATION = {
     "scratch": "none",
@@ -102,6 +103,12 @@ class Run:
     def wpt(self) -> dict[str, Any]:
         """The keywords of WPT, the method's switches included."""
         return {**self.preset.wpt, **METHODS[self.method].wpt}
+
+    @property
+    def retrieves(self) -> bool:
+        """Whether trajectories are retrieved, for rehearsal or for guidance."""
+        wpt = wpt_keywords() | self.wpt
+        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or wpt["guidance"])
 
     @property
     def updates(self) -> int:
@@ -190,8 +197,8 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
     shared = {job.shared.model_path: job.shared for job in jobs if METHODS[job.method].needs_data}
     for path, each in shared.items():
         episodes = each.preset.collect.episodes * len(each.tasks)
-        state = "there" if each.data_path.exists() else f"{episodes} episodes to collect"
+        state = "there" if each.data_path.exists() else f"{counted(episodes, 'episode')} to collect"
         console.print(f"dataset      {state}  [dim]{each.data_path}")
         done = (path / "done.json").exists()
-        state = "there" if done else f"{each.preset.pretrain.steps:,} updates to make"
+        state = "there" if done else f"{counted(each.preset.pretrain.steps, 'update')} to make"
         console.print(f"world model  {state}  [dim]{path}")

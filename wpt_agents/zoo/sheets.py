@@ -2,8 +2,10 @@
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +16,7 @@ from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.pictures import COLOURS, INK, MUTED, plt
 
-COLUMNS = 8  # images of a trajectory on the contact sheet
+COLUMNS = 8  # images in a row of the contact sheet, and of a run's retrieval sheet
 
 
 class Query(NamedTuple):
@@ -112,17 +114,24 @@ def query_of(dataset: TrajectoryDataset, i: int) -> Query:
     return Query(name, trajectory.image[0], trajectory.embodiment, trajectory.action_dim, i)
 
 
-def query_at(task: Task, rendering: str) -> Query:
-    """The first image of a task, as fine-tuning would search for it."""
-    env = gym.make(task.id, rendering=rendering)
-    image, _ = env.reset(seed=0)
-    env.close()
+def query_at(task: Task, env: Mapping[str, Any], seed: int = 0) -> Query:
+    """The first image of a task, as fine-tuning by this seed searches for it.
+
+    :param env: keyword arguments of `gymnasium.make`
+    """
+    with closing(gym.make(task.id, **env)) as made:
+        image, _ = made.reset(seed=seed)
     return Query(f"first image of\n{_cut(task.name, 18)}", image, task.embodiment, task.action_dim)
 
 
 def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
-    """The nearest by Eq. (5), the query's own trajectory left out."""
-    known = (query.embodiment, query.action_dim) if own_robot else (None, None)
+    """The nearest by Eq. (5), the query's own trajectory left out.
+
+    :param own_robot: only what `WPT.learn` would retrieve, by robot and action width
+    """
+    assert model.dataset is not None
+    robot = query.embodiment if query.embodiment in model.dataset.embodiments else None
+    known = (robot, query.action_dim) if own_robot else (None, None)
     feature = model.policy.embed(query.image[None])[0]
     indices, distances = model.build_index().search(feature, number + 1, *known)
     others = indices != (-1 if query.own is None else query.own)
@@ -151,7 +160,19 @@ def retrieval_sheet(
                 f"#{i}  d {distance:.3g}\n{_kind(task, robot)}", fontsize=6.5, color=INK, pad=3
             )
     robots = "blue: the query's own robot, orange: another"
-    _finish(figure, path, f"First images and the nearest in {dataset.path} ({robots})")
+    _finish(figure, path, f"First images and the nearest in {dataset.path.name} ({robots})")
+
+
+def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], seed: int) -> None:
+    """Draws what a run begins by retrieving, and below it the nearest of all robots."""
+    assert model.dataset is not None
+    query = query_at(task, env, seed)
+    rows = {"retrieved for\n": True, "nearest of all\n": False}
+    found = [
+        search(model, query._replace(name=f"{name}{_cut(task.name, 18)}"), COLUMNS, own_robot)
+        for name, own_robot in rows.items()
+    ]
+    retrieval_sheet(path, model.dataset, found)
 
 
 def _draw(axis: plt.Axes, image: np.ndarray, colour: str = MUTED, width: float = 0.5) -> None:

@@ -9,7 +9,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,8 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.archive import replacing
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.distributed import World
+from wpt_agents.names import counted
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.checkpoints import ContinuedCSV
 from wpt_agents.zoo.collect import collect
@@ -31,13 +33,16 @@ from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, Score, evaluate
 from wpt_agents.zoo.presets import Preset
 from wpt_agents.zoo.tasks import find_tasks
 
+Callback = Callable[[int, dict[str, float]], None]  # of pre-training
+
 console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 # Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
 FINE_TUNING = {
     *("actor_critic_learning_rate", "gamma", "lam", "ent_coef", "imagine_horizon", "return_norm"),
     *("target_fraction", "train_ratio", "learning_starts", "warmup_steps", "guidance"),
-    *("offline_ratio", "num_retrieve", "bc_steps", "bc_batch_size", "bc_learning_rate"),
+    *("offline_ratio", "retrieval", "num_retrieve"),
+    *("bc_steps", "bc_batch_size", "bc_learning_rate"),
 }
 
 
@@ -85,6 +90,7 @@ class Shared:
     :param workers: processes that collect
     :param device: where to pre-train
     :param given_data: a dataset to use in the place of the preset's
+    :param accumulate: passes over a batch of pre-training
     """
 
     preset: Preset
@@ -93,6 +99,7 @@ class Shared:
     workers: int = 2
     device: str = "auto"
     given_data: Path | None = None
+    accumulate: int = 1
 
     @property
     def env(self) -> dict[str, Any]:
@@ -133,7 +140,7 @@ class Shared:
         """Stage 1: the dataset, collected unless it is there; half of one is continued."""
         if self.given_data is not None:
             dataset = TrajectoryDataset.open(self.given_data)
-            say("collect", f"given, {len(dataset)} episodes  [dim]{self.data_path}")
+            say("collect", f"given, {counted(len(dataset), 'episode')}  [dim]{self.data_path}")
             return dataset
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
@@ -143,7 +150,8 @@ class Shared:
             found = 0  # `collect` says what is wrong
         state = "reused" if found == wanted else f"continued at {found} of" if found else "making"
         names = ", ".join(given.tasks) or f"all tasks of {self.suite}"
-        say("collect", f"{state} {wanted} reward-free episodes of {names}  [dim]{self.data_path}")
+        episodes = counted(wanted, "reward-free episode")
+        say("collect", f"{state} {episodes} of {names}  [dim]{self.data_path}")
         return collect(
             self.data_path,
             self.tasks,
@@ -156,31 +164,35 @@ class Shared:
 
     def model(self, dataset: TrajectoryDataset) -> Path:
         """Stage 2: the file of the pre-trained model; half a pre-training is continued."""
-        given, folder = self.preset.pretrain, self.model_path
+        given, folder, world = self.preset.pretrain, self.model_path, World.current()
         model, done = folder / "model.zip", folder / "done.json"
-        with locked(folder / "lock", wait=True):
-            state = "reused" if done.exists() else "continued" if model.exists() else "making"
-            say("pretrain", f"{state} a world model of {given.steps:,} updates  [dim]{folder}")
-            if not done.exists():
+        with locked(folder / "lock", wait=True) if world.rank == 0 else nullcontext():
+            finished = world.rank_0s(done.exists())
+            state = "reused" if finished else "continued" if model.exists() else "making"
+            updates = counted(given.steps, "update")
+            say("pretrain", f"{state} a world model of {updates}  [dim]{folder}")
+            if not finished:
                 start = time.perf_counter()
-                self._pretrain(dataset, folder)
-                write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
+                with log_in(folder) if world.rank == 0 else nullcontext() as callback:
+                    self._pretrain(dataset, folder, callback)
+                if world.rank == 0:
+                    write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
         return model
 
-    def _pretrain(self, dataset: TrajectoryDataset, folder: Path) -> None:
-        table = ContinuedCSV(folder / "progress.csv")
-        logger = Logger(str(folder), [table, TensorBoardOutputFormat(str(folder))])
-        with closing(logger):
-            WPT.pretrain(
-                dataset,
-                steps=self.preset.pretrain.steps,
-                run_dir=folder,
-                seed=self.preset.pretrain.seed,
-                device=self.device,
-                progress_bar=True,
-                callback=writing_to(logger, table),
-                **self.pretraining,
-            )
+    def _pretrain(
+        self, dataset: TrajectoryDataset, folder: Path, callback: Callback | None
+    ) -> None:
+        WPT.pretrain(
+            dataset,
+            steps=self.preset.pretrain.steps,
+            run_dir=folder,
+            seed=self.preset.pretrain.seed,
+            device=self.device,
+            progress_bar=True,
+            callback=callback,
+            accumulate=self.accumulate,
+            **self.pretraining,
+        )
 
     def index(self, model: WPT) -> None:
         """Stage 3: the features of every first image, kept beside the dataset."""
@@ -211,7 +223,16 @@ BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
 }
 
 
-def writing_to(logger: Logger, table: ContinuedCSV) -> Callable[[int, dict[str, float]], None]:
+@contextmanager
+def log_in(folder: Path) -> Iterator[Callback]:
+    """A callback of pre-training that logs to `folder`, as a table and for TensorBoard."""
+    table = ContinuedCSV(folder / "progress.csv")
+    logger = Logger(str(folder), [table, TensorBoardOutputFormat(str(folder))])
+    with closing(logger):
+        yield writing_to(logger, table)
+
+
+def writing_to(logger: Logger, table: ContinuedCSV) -> Callback:
     """A callback of pre-training that logs the metrics' means over 50 updates."""
     begun = False
 

@@ -67,6 +67,11 @@ def resample(scores: Scores, draws: int, rng: np.random.Generator) -> list[np.nd
     return [s[rng.integers(len(s), size=(draws, len(s)))] for s in scores]
 
 
+def resamplable(scores: Scores) -> bool:
+    """Whether each stratum has several scores: of a single one the bootstrap sees no spread."""
+    return all(len(stratum) > 1 for stratum in scores)
+
+
 def bootstrap(
     statistic: Callable[..., np.ndarray], *groups: Scores, draws: int = DRAWS, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:

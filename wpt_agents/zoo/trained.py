@@ -12,6 +12,7 @@ from wpt_agents.names import unknown_name
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import pictures
 from wpt_agents.zoo.evaluation import Score, evaluate, film
+from wpt_agents.zoo.machine import check_device
 from wpt_agents.zoo.presets import EnvSettings
 from wpt_agents.zoo.tasks import find_tasks
 
@@ -33,6 +34,7 @@ class Trained:
         """The policy: "wpt", or the "prior" actor that guided it. Needs no dataset."""
         if policy not in POLICIES:
             raise unknown_name("policy", policy, POLICIES)
+        check_device(device)
         model = WPT.load(self.model, device=device)
         if policy == "wpt":
             return model

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 
 from wpt_agents.zoo.plan import Run
-from wpt_agents.zoo.report import number
+from wpt_agents.zoo.report.tables import number
 from wpt_agents.zoo.stages import console
 from wpt_agents.zoo.tasks import short_name
 

@@ -30,7 +30,7 @@ METAWORLD = (
 )
 TASK_IDS = [f"wpt/dmc-{name}-v0" for name in DMC] + [f"wpt/metaworld-{n}-v0" for n in METAWORLD]
 LOOK = {"rendering": "fast"}
-EPISODES, STEPS, NEAREST, QUERIES = 20, 400, 10, 10
+EPISODES, STEPS, NEAREST, QUERIES = 20, 2000, 10, 10
 MODEL = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
 PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
 

@@ -1,6 +1,7 @@
 """What run folders hold, read back."""
 
 import base64
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,7 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 
-from wpt_agents.zoo import report
-from wpt_agents.zoo.aggregates import Experiment
+from wpt_agents.zoo.report.aggregates import Experiment
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,15 @@ class Finished:
         return f"{self.result['task']}-{one.method}-{one.preset}-{one.frames}-{self.result['seed']}"
 
     def media(self) -> dict[str, str]:
-        """Video and prediction strip as data URIs, by their file's name without its ending."""
+        """Video, predictions and what was retrieved, as data URIs by their files' stems."""
         found = {}
         if (video := self.folder / "policy.mp4").exists():
             found["policy"] = data_uri("video/mp4", video.read_bytes())
-        if (strip := self.folder / "predictions.png").exists():
-            pixels = imageio.imread(strip)[..., :3]
-            small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
-            found["predictions"] = data_uri("image/jpeg", small)
+        for name in ("predictions", "retrieval"):
+            if (picture := self.folder / f"{name}.png").exists():
+                pixels = imageio.imread(picture)[..., :3]
+                small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
+                found[name] = data_uri("image/jpeg", small)
         return found
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -76,9 +77,39 @@ def data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
+def read_runs(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """Every finished run below `folder` and its result, in the order of their paths.
+
+    :raises ValueError: a run that stands there twice, which would count as two seeds
+    """
+    runs = [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
+    seen: dict[tuple[Any, ...], Path] = {}
+    for path, result in runs:
+        one = tuple(result[name] for name in ("task", "method", "preset", "frames", "seed"))
+        if one in seen:
+            raise ValueError(
+                f"{seen[one]} and {path} are the same run: report one of their folders, or delete "
+                "one of them"
+            )
+        seen[one] = path
+    return runs
+
+
+def read_results(folder: Path) -> list[dict[str, Any]]:
+    """The results of `read_runs`."""
+    return [result for _, result in read_runs(folder)]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}); delete it and run again") from None
+
+
 def find_finished(folder: Path) -> list[Finished]:
     """Every finished run below `folder`."""
-    return [Finished(*run) for run in report.read_runs(folder)]
+    return [Finished(*run) for run in read_runs(folder)]
 
 
 def find_unfinished(folder: Path) -> list[Unfinished]:

@@ -39,7 +39,7 @@ class Line:
     """One method's line with its band.
 
     :param x: (N,)
-    :param band: the middle and the ends of its 95 % interval, (N,) each
+    :param band: the middle and the ends of its 95 % interval, (N,) each; the middle itself for none
     """
 
     label: str
@@ -126,20 +126,21 @@ def lines(
 def bars(
     title: str,
     y_label: str,
-    given: Mapping[str, tuple[float, float, float]],
+    given: Mapping[str, tuple[float, float | None, float | None]],
     colours: Sequence[str],
 ) -> str:
-    """A bar for each name, with its 95 % interval."""
+    """A bar for each name, with its 95 % interval where it has one."""
     with matplotlib.rc_context(STYLE):
         figure, axes = _axes()
         for place, (value, low, high) in enumerate(given.values()):
-            error = [[max(value - low, 0)], [max(high - value, 0)]]
             axes.bar(place, value, 0.62, color=colours[place], alpha=0.85)
-            axes.errorbar(place, value, error, color=INK, capsize=3, lw=1)
+            if low is not None and high is not None:
+                error = [[max(value - low, 0)], [max(high - value, 0)]]
+                axes.errorbar(place, value, error, color=INK, capsize=3, lw=1)
         texts = [f"{name}\n{value:.2f}" for name, (value, *_) in given.items()]
         axes.set_xticks(range(len(given)), texts)
         axes.set(title=title, ylabel=y_label)
-        if not any(high > 0 for _, _, high in given.values()):
+        if not any(max(value, high or 0) > 0 for value, _, high in given.values()):
             axes.set_ylim(0, 1)  # nothing to see: an axis around 0 would look like a fault
         axes.grid(False, axis="x")
         return svg(figure, title)

@@ -1,19 +1,18 @@
-"""Run folders -> tables: one run's policies, and many runs' means over seeds."""
+"""Results -> tables: one run's policies, and many runs' means over seeds."""
 
 import csv
 import io
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from rich.table import Table
 
-from wpt_agents.zoo.aggregates import references, score_of
-from wpt_agents.zoo.statistics import bootstrap, mean, mean_interval
+from wpt_agents.names import counted
+from wpt_agents.zoo.report.aggregates import estimate, references, score_of
+from wpt_agents.zoo.statistics import mean, mean_interval
 
 POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
 
@@ -37,36 +36,6 @@ class Row:
     paper: float | None
 
 
-def read_runs(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """Every finished run below `folder` and its result, in the order of their paths.
-
-    :raises ValueError: a run that stands there twice, which would count as two seeds
-    """
-    runs = [(path.parent, _read(path)) for path in sorted(folder.glob("**/result.json"))]
-    seen: dict[tuple[Any, ...], Path] = {}
-    for path, result in runs:
-        one = tuple(result[name] for name in ("task", "method", "preset", "frames", "seed"))
-        if one in seen:
-            raise ValueError(
-                f"{seen[one]} and {path} are the same run: report one of their folders, or delete "
-                "one of them"
-            )
-        seen[one] = path
-    return runs
-
-
-def read_results(folder: Path) -> list[dict[str, Any]]:
-    """The results of `read_runs`."""
-    return [result for _, result in read_runs(folder)]
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); delete it and run again") from None
-
-
 def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:
     """One row for each task, method, preset and budget."""
     groups: dict[tuple[str, str, str, int], list[float]] = defaultdict(list)
@@ -86,8 +55,9 @@ class PolicyRow:
 
     :param method: "" for a policy that no method has a part in
     :param means: of each seed, over its `episodes` episodes
-    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again
-    :param seeds_low: bootstrap of the seeds' means: were other seeds trained
+    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again;
+        None with one episode
+    :param seeds_low: bootstrap of the seeds' means: were other seeds trained; None with one seed
     :param t_low: the same by Student's t, which is wider for few seeds
     :param success: share of episodes that end in success, None where the task counts none
     """
@@ -101,8 +71,8 @@ class PolicyRow:
     seeds: tuple[int, ...]
     means: tuple[float, ...]
     mean: float
-    episodes_low: float
-    episodes_high: float
+    episodes_low: float | None
+    episodes_high: float | None
     seeds_low: float | None
     seeds_high: float | None
     t_low: float | None
@@ -126,8 +96,8 @@ class PolicyRow:
             tuple(seeds),
             tuple(means),
             middle,
-            *map(float, bootstrap(mean, returns)),
-            *(map(float, bootstrap(mean, [np.array(means)])) if len(seeds) > 1 else (None, None)),
+            *estimate(mean, returns)[1:],
+            *estimate(mean, [np.array(means)])[1:],
             *student,
             None if None in rates else float(np.mean(rates)),
             tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),
@@ -183,8 +153,8 @@ def number(value: float | None) -> str:
 def scores_table(result: Mapping[str, Any]) -> Table:
     """The policies of one run side by side."""
     about = f"{result['task']}, {result['method']}, seed {result['seed']}"
-    episodes = len(result["scores"]["WPT"]["returns"])
-    caption = f"{episodes} episodes each, after {result['frames']:,} frames of fine-tuning"
+    episodes = counted(len(result["scores"]["WPT"]["returns"]), "episode")
+    caption = f"{episodes} each, after {result['frames']:,} frames of fine-tuning"
     table = Table(title=about, caption=caption)
     table.add_column("policy")
     for heading in ("mean return", "95 % interval", "lowest", "highest"):
@@ -269,7 +239,7 @@ def policy_markdown(rows: Sequence[PolicyRow]) -> str:
         seeds = sorted({seed for row in table for seed in row.seeds})
         commits = sorted({commit for row in table for commit in row.commits})
         episodes = min(row.episodes for row in table)
-        about = f"Seeds {', '.join(map(str, seeds))}, {episodes} episodes each; "
+        about = f"Seeds {', '.join(map(str, seeds))}, {counted(episodes, 'episode')} each; "
         about += f"commit {', '.join(commits)}."
         lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
         parts.append(f"### {title}\n\n{lines}\n{about}\n")

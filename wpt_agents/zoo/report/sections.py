@@ -2,16 +2,24 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.zoo import aggregates, figures, report
-from wpt_agents.zoo.aggregates import STATISTICS, Estimate, Experiment, Reference
-from wpt_agents.zoo.folders import Finished
 from wpt_agents.zoo.plan import ABLATION
-from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile
+from wpt_agents.zoo.report import aggregates, figures
+from wpt_agents.zoo.report.aggregates import STATISTICS, Estimate, Experiment, Reference
+from wpt_agents.zoo.report.folders import Finished
+from wpt_agents.zoo.report.tables import above, interval_text, policies
+from wpt_agents.zoo.statistics import (
+    bootstrap,
+    mean,
+    mean_interval,
+    performance_profile,
+    resamplable,
+)
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
 TITLES = {3: "Meta-World", 4: "Meta-World, continued", 5: "DMControl"}
@@ -37,9 +45,12 @@ class Names:
 
 
 def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """For each suite and budget: on how many tasks WPT's interval lies above another policy's."""
+    """For each suite and budget: on how many tasks WPT's interval lies above another policy's.
+
+    Tasks with a single seed have no interval and do not count; `against` is empty if all are such.
+    """
     tables: dict[tuple[str, str, int], dict[str, dict[tuple[str, str], Any]]] = {}
-    for row in report.policies(results):
+    for row in policies(results):
         about = row.task.split("-")[0], row.preset, row.frames
         tables.setdefault(about, {}).setdefault(row.task, {})[row.method, row.policy] = row
     others = {"random policy": ("", "random"), "prior actor": ("wpt", "prior actor")}
@@ -55,10 +66,10 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             ]
             pairs = [pair for pair in pairs if all(row.t_low is not None for row in pair)]
             if pairs:
-                above = sum(report.above(ours, theirs) for ours, theirs in pairs)
-                below = sum(report.above(theirs, ours) for ours, theirs in pairs)
-                against.append({"name": name, "above": above, "below": below, "of": len(pairs)})
-        if against:
+                higher = sum(above(ours, theirs) for ours, theirs in pairs)
+                lower = sum(above(theirs, ours) for ours, theirs in pairs)
+                against.append({"name": name, "above": higher, "below": lower, "of": len(pairs)})
+        if any(("wpt", "WPT") in t for t in tasks.values()):
             told.append(
                 {"suite": SUITES[suite], "preset": preset, "frames": frames, "against": against}
             )
@@ -145,8 +156,9 @@ def profile(suite: str, found: Mapping[Experiment, Scores], names: Names) -> str
     given = []
     for one, tasks in found.items():
         scores = [np.array(each) for each in tasks.values()]
-        band = shares(scores), *bootstrap(shares, scores, draws=2000)
-        given.append(figures.Line(names(one), THRESHOLDS, band))
+        middle, known = shares(scores), resamplable(scores)
+        ends = bootstrap(shares, scores, draws=2000) if known else (middle, middle)
+        given.append(figures.Line(names(one), THRESHOLDS, (middle, *ends)))
     title = f"{SUITES[suite]}: performance profile"
     return figures.lines(
         title, "normalised score τ", "share of runs > τ", given, names.all, step=True
@@ -211,33 +223,35 @@ def curve(label: str, seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> figures
 def paper_tables(runs: Sequence[Finished], names: Names) -> list[dict[str, Any]]:
     """Tables 3 to 5 with our numbers beside the paper's; only of suites that were run."""
     tables = []
-    for table, title in TITLES.items():
-        printed = [row for row in aggregates.references() if row.table == table]
-        suite = printed[0].suite
-        of_suite = [run for run in runs if run.result["suite"] == suite]
-        if not of_suite:
-            continue
-        cells: dict[tuple[str, str], list[Finished]] = defaultdict(list)
-        for run in of_suite:
-            cells[run.result["task"], names(run.experiment)].append(run)
-        ours = list(dict.fromkeys(name for _, name in cells))
-        tasks = list(dict.fromkeys(row.task for row in printed))
-        columns = list(dict.fromkeys((row.method, row.samples) for row in reversed(printed)))
-        tables.append(
-            {
-                "number": table,
-                "title": title,
-                "metric": "success rate" if suite == "metaworld" else "return",
-                "columns": [
-                    f"{BASELINES[method]} @ {samples_text(samples)}" for method, samples in columns
-                ],
-                "ours": ours,
-                "rows": [table_row(task, printed, columns, ours, cells) for task in tasks],
-                "source": printed[0].source,
-                "misprints": any(aggregates.misprint(row) is not None for row in printed),
-            }
-        )
+    for number, title in TITLES.items():
+        printed = [row for row in aggregates.references() if row.table == number]
+        given = [run for run in runs if run.result["suite"] == printed[0].suite]
+        if given:
+            tables.append({"number": number, "title": title} | paper_table(printed, given, names))
     return tables
+
+
+def paper_table(
+    printed: Sequence[Reference], runs: Sequence[Finished], names: Names
+) -> dict[str, Any]:
+    """One of them. Tasks that were not run stand apart: in a report of one task, all but one."""
+    cells: dict[tuple[str, str], list[Finished]] = defaultdict(list)
+    for run in runs:
+        cells[run.result["task"], names(run.experiment)].append(run)
+    ours = list(dict.fromkeys(name for _, name in cells))
+    tasks = list(dict.fromkeys(row.task for row in printed))
+    columns = list(dict.fromkeys((row.method, row.samples) for row in reversed(printed)))
+    row = partial(table_row, printed=printed, columns=columns, ours=ours, cells=cells)
+    shown = {*(task for task, _ in cells), *STATISTICS}
+    return {
+        "metric": "success rate" if printed[0].suite == "metaworld" else "return",
+        "columns": [f"{BASELINES[method]} @ {samples_text(n)}" for method, n in columns],
+        "ours": ours,
+        "rows": [row(task) for task in tasks if task in shown],
+        "not_run": [row(task) for task in tasks if task not in shown],
+        "source": printed[0].source,
+        "misprints": any(aggregates.misprint(row) is not None for row in printed),
+    }
 
 
 def table_row(
@@ -278,13 +292,13 @@ def our_cell(runs: Sequence[Finished]) -> dict[str, Any] | None:
     if not runs:
         return None
     scores = [aggregates.score_of(run.result) for run in runs]
-    middle, low, high = report.mean_interval(scores)
+    middle, low, high = mean_interval(scores)
     if runs[0].result["metric"] == "success" and low is not None and high is not None:
         low, high = max(low, 0.0), min(high, 1.0)
     return {
         "run": runs[0].name,
         "mean": middle,
-        "interval": report.interval_text(low, high) if low is not None else "",
+        "interval": "one seed: no interval" if low is None else interval_text(low, high),
         "seeds": [run.result["seed"] for run in runs],
         "frames": runs[0].result["frames"],
         "commits": sorted({run.result.get("commit") or "unknown" for run in runs}),

@@ -18,11 +18,12 @@ from wpt_agents.zoo.statistics import (
     median,
     optimality_gap,
     probability_of_improvement,
+    resamplable,
 )
 
 BEST_RETURN = 1000.0  # of a DMControl episode; a success rate is a share already
 STATISTICS = {"mean": mean, "median": median, "IQM": iqm, "optimality gap": optimality_gap}
-Estimate = tuple[float, float, float]  # value, and its 95 % interval
+Estimate = tuple[float, float | None, float | None]  # value, and its 95 % interval if it has one
 
 
 @dataclass(frozen=True, order=True)
@@ -103,9 +104,12 @@ def aggregate(tasks: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
 
 
 def estimate(statistic: Any, *groups: Sequence[np.ndarray]) -> Estimate:
-    """A statistic of scores and its 95 % interval."""
+    """A statistic of scores and its 95 % interval, which it has not if a task has a single run."""
+    value = float(statistic(*groups))
+    if not all(map(resamplable, groups)):
+        return value, None, None
     low, high = bootstrap(statistic, *groups)
-    return float(statistic(*groups)), float(low), float(high)
+    return value, float(low), float(high)
 
 
 def improvement(

@@ -10,10 +10,10 @@ import jinja2
 import yaml
 
 from wpt_agents.archive import replacing
-from wpt_agents.names import unknown_name
-from wpt_agents.zoo import aggregates, report, sections
-from wpt_agents.zoo.folders import Finished, Unfinished, find_finished, find_unfinished
-from wpt_agents.zoo.sections import Names
+from wpt_agents.names import counted, unknown_name
+from wpt_agents.zoo.report import aggregates, sections, tables
+from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
+from wpt_agents.zoo.report.sections import Names
 
 MEDIA = ("first", "all", "none")
 
@@ -33,9 +33,14 @@ def write_page(folder: Path, path: Path, media: str = "first") -> None:
 
 def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: str = "first") -> str:
     """The page's HTML."""
-    loader = jinja2.PackageLoader("wpt_agents.zoo", ".")
+    loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    env.filters |= {"number": report.number, "share": "{:.2f}".format, "count": "{:,}".format}
+    env.filters |= {
+        "number": tables.number,
+        "share": "{:.2f}".format,
+        "count": "{:,}".format,
+        "counted": counted,
+    }
     runs = sorted(runs, key=_order)
     names, results = Names(run.experiment for run in runs), [run.result for run in runs]
     suites = dict.fromkeys(run.result["suite"] for run in runs)
@@ -43,9 +48,9 @@ def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: st
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         suites=[sections.suite(name, runs, names) for name in suites],
         tables=sections.paper_tables(runs, names),
-        policies=report.by_task(report.policies(results)),
-        policy_cells=report.policy_cells,
-        policy_headings=report.POLICY_HEADINGS,
+        policies=tables.by_task(tables.policies(results)),
+        policy_cells=tables.policy_cells,
+        policy_headings=tables.POLICY_HEADINGS,
         runs=[card(run, names, media in illustrated(run, runs)) for run in runs],
         unfinished=unfinished,
         headline=sections.headline(results),
@@ -70,7 +75,7 @@ def illustrated(run: Finished, runs: Sequence[Finished]) -> set[str]:
 def card(run: Finished, names: Names, pictures: bool) -> dict[str, Any]:
     """Everything about one run: scores, command, seed, commit, versions, pictures."""
     system = json.loads(run.text("system.json") or "{}")
-    scores = {report.POLICIES.get(n, n): s for n, s in run.result["scores"].items()}
+    scores = {tables.POLICIES.get(n, n): s for n, s in run.result["scores"].items()}
     return {
         "id": run.name,
         "name": names(run.experiment),

@@ -1,0 +1,92 @@
+"""The record of results: what stands in it, how it grows, what it says together."""
+
+import pytest
+from run_folders import make_run
+from typer.testing import CliRunner
+
+from wpt_agents.zoo.__main__ import app
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.report.folders import find_finished
+
+
+def lines_of(folder):
+    return record.lines_of(find_finished(folder))
+
+
+def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc"):
+    return record.Line(suite, task, method, seed, frames, score, 0, None, 0, "c", "x")
+
+
+def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", seed=2, returns=(300.0, 500.0), preset="tiny size=debug")
+    make_run(tmp_path, "metaworld-reach", returns=(3.0, 9.0, 9.0, 9.0), method="no-pretrain")
+    lines = {(each.task, each.method): each for each in lines_of(tmp_path)}
+    walker = lines["dmc-walker-run", "wpt"]
+    assert (walker.score, walker.return_, walker.success) == (40, 400, None)
+    assert (walker.hours, walker.commit) == (pytest.approx(2 / 3600, abs=1e-4), "0123456789ab")
+    assert walker.command == (
+        "python -m wpt_agents.zoo run --suite dmc --tasks dmc-walker-run --method wpt "
+        "--preset tiny --frames 1000 --seeds 2-2 --set size=debug"
+    )
+    reach = lines["metaworld-reach", "no-pretrain"]
+    assert (reach.score, reach.success) == (75, 0.75)
+    assert {m for task, m in lines if task == "dmc-walker-run"} == {
+        *("nothing", "random", "prior actor", "wpt")
+    }
+
+
+def test_data_of_ones_own_are_in_the_command():
+    result = {"suite": "dmc", "task": "t", "method": "wpt", "seed": 0, "frames": 10}
+    told = record.command(result | {"preset": "tiny data=mine guidance=linear(1,0,9)"})
+    assert told.endswith("--data mine --set 'guidance=linear(1,0,9)'")
+
+
+def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
+    names = [("WPT", "scratch"), ("WPT, last", "wpt"), ("prior actor", "no-pretrain")]
+    told = [record._method(*each) for each in names]
+    assert told == ["scratch", "wpt, last", "prior actor, no-pretrain"]
+
+
+def test_a_record_grows_and_replaces_the_same_run(tmp_path):
+    path = tmp_path / "small.csv"
+    first = [line("wpt", 1.5), line("wpt", 2.0, seed=1)]
+    assert record.update(path, first) == record.read(path) == first
+    again = record.update(path, [line("wpt", 9.0, seed=1), line("scratch", 3.0)])
+    assert [(each.method, each.score) for each in again] == [
+        *[("scratch", 3.0), ("wpt", 1.5), ("wpt", 9.0)]
+    ]
+    assert path.read_text().splitlines()[0] == (
+        "suite,task,method,seed,frames,score,return,success,hours,commit,command"
+    )
+
+
+def test_another_csv_is_refused(tmp_path):
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match=r"other.csv is no record.*its columns are suite"):
+        record.read(tmp_path / "other.csv")
+
+
+def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
+    lines = [
+        *[line("wpt", 0.0, task=f"dmc-{i}") for i in range(3)],
+        *[line("wpt", score, "mw-a", seed, 50, "mw") for seed, score in enumerate((80.0, 100.0))],
+        *[line("scratch", 30.0, "mw-a", 0, 150, "mw"), line("random", 7.0, "mw-a", 0, 0, "mw")],
+    ]
+    found = record.by_suite(lines)
+    assert found["wpt"]["dmc"][0] == 3 and found["wpt"]["mw"][1].mean == 90
+    both = found["wpt"]["both"][1]
+    assert (both.mean, both.low, both.high) == (45, 40, 50)
+    assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
+
+
+def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
+    for seed in range(2):
+        make_run(tmp_path / "runs", "dmc-walker-run", seed, returns=(300.0, 500.0))
+    path = tmp_path / "small.csv"
+    ran = CliRunner().invoke(app, ["report", str(tmp_path / "runs"), "--record", str(path)])
+    assert ran.exit_code == 0, ran.output
+    assert len(record.read(path)) == 8
+    assert "| dmc-walker-run | wpt | 1,000 | 40.0 (40.0 to 40.0), n=2 | 40.0 40.0 |" in (
+        path.with_suffix(".md").read_text()
+    )
+    assert path.with_suffix(".png").stat().st_size > 1000

@@ -1,0 +1,15 @@
+"""The command line as a user calls it, without a process of its own."""
+
+import sys
+
+from wpt_agents.zoo import __main__ as command_line
+
+
+def call(monkeypatch, *words):
+    """What `python -m wpt_agents.zoo WORDS` ends with: its exit code."""
+    monkeypatch.setattr(sys, "argv", ["zoo", *map(str, words)])
+    try:
+        command_line.main()
+    except SystemExit as stopped:
+        return stopped.code
+    return 0

@@ -1,0 +1,41 @@
+"""What this machine has of what a command asks for: an engine's package, a GPU."""
+
+import importlib
+from types import ModuleType
+
+import torch
+
+from wpt_agents.names import unknown_name
+
+ENGINES = {"none": "", "local": "", "ray": "ray", "slurm": "submitit"}  # and their packages
+
+
+def import_extra(name: str, extra: str) -> ModuleType:
+    """The module of an extra, or the line that installs it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ValueError(f'{name} is not installed: pip install "wpt-agents[{extra}]"') from None
+
+
+def check_machine(engine: str, device: str) -> None:
+    """Refuses an engine whose package is not here, and a device for runs on this machine."""
+    if engine not in ENGINES:
+        raise unknown_name("engine", engine, ENGINES)
+    if package := ENGINES[engine]:
+        import_extra(package, engine)
+    else:
+        check_device(device)
+
+
+def check_device(device: str) -> None:
+    """Refuses a device that torch does not find; SB3 would take the CPU without a word."""
+    try:
+        wanted = torch.device("cpu" if device == "auto" else device)
+    except RuntimeError:
+        raise ValueError(f"--device {device}: write auto, cpu, cuda, or cuda:1") from None
+    if wanted.type == "cuda" and (wanted.index or 0) >= torch.cuda.device_count():
+        raise ValueError(
+            f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
+            "GPUs here; take --device cpu, or a build of torch with CUDA and a driver"
+        )

@@ -1,0 +1,59 @@
+"""The command `report`. Imports stand inside it so that `--help` answers at once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Run folders are searched below it.")] = Path(
+        "runs"
+    ),
+    markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
+    csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="A CSV to keep a line of every policy and run in; what it holds stays."),
+    ] = None,
+    media: Annotated[
+        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
+    ] = "first",
+) -> None:
+    """Shows the mean over seeds of every task and method, and writes a page about all runs.
+
+    The page is one file that needs no network: the paper's tables beside yours, aggregates with
+    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
+    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
+    prior actor, WPT. A record (--record results.csv) is small enough to keep when the run folders
+    are gone; results.md and results.png beside it show it.
+    """
+    from wpt_agents.zoo.report import record as records
+    from wpt_agents.zoo.report import tables
+    from wpt_agents.zoo.report.folders import find_finished, read_results
+    from wpt_agents.zoo.report.page import write_page
+    from wpt_agents.zoo.stages import console
+
+    results = read_results(folder)
+    if not results:
+        raise ValueError(f"No finished run below {folder}: there is no result.json.")
+    rows, policies = tables.summarise(results), tables.policies(results)
+    as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
+    if csv:
+        typer.echo(tables.policy_csv(policies), nl=False)
+    elif markdown:
+        typer.echo(as_markdown, nl=False)
+    else:
+        page = (out or folder / "report") / "index.html"
+        write_page(folder, page, media)
+        page.with_name("report.md").write_text(as_markdown)
+        page.with_name("policies.csv").write_text(tables.policy_csv(policies))
+        console.print(tables.summary_table(rows))
+        if record is not None:
+            lines = records.update(record, records.lines_of(find_finished(folder)))
+            record.with_suffix(".md").write_text(records.markdown(lines))
+            records.draw(record.with_suffix(".png"), lines)
+        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")

@@ -346,7 +346,7 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_pa
     assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
     told = capsys.readouterr().out
     assert told.count("dmc-cheetah-run-back ") == 2
-    assert "4 episodes to collect" in told and " runs to do" in told
+    assert "6 episodes to collect" in told and " runs to do" in told
     assert not (tmp_path / "runs").exists()
 
 

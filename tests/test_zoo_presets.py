@@ -2,9 +2,11 @@ import csv
 from statistics import mean, median
 
 import pytest
+from debug_agent import recorded
 
+from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.zoo import presets
-from wpt_agents.zoo.plan import parse_seeds
+from wpt_agents.zoo.plan import make_plan, parse_seeds
 from wpt_agents.zoo.presets import load_preset, preset_folder, preset_names, read_yaml, suite_names
 from wpt_agents.zoo.tasks import find_tasks
 
@@ -165,3 +167,32 @@ def test_every_reference_names_a_task_that_exists_and_its_source():
             for row in csv.DictReader(file):
                 assert row["source"].endswith(f"Table {number}")
                 assert row["task"] in ("mean", "median") or find_tasks(suite, [row["task"]])
+
+
+def plan(suite, tasks, preset, tmp_path, method="wpt", settings=(), data=None):
+    return make_plan(suite, tasks, preset, "1", [method], settings, tmp_path, 1, "cpu", data)
+
+
+@pytest.mark.parametrize("suite", suite_names())
+@pytest.mark.parametrize("preset", ["debug", "paper"])
+def test_a_whole_suite_can_be_run_from_its_presets_own_data(suite, preset, tmp_path):
+    assert plan(suite, [], preset, tmp_path)
+
+
+def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
+    settings = ["max_action_dim=12"]
+    with pytest.raises(ValueError, match=r"quadruped-walk has 12 actions.*\(1, 6\).*collect.tasks"):
+        plan("dmc", ["quadruped-walk"], "demo", tmp_path, settings=settings)
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch", settings)
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "pretrain-only", settings)
+    with TrajectoryDataset.create(tmp_path / "own") as dataset:
+        dataset.append(recorded(actions=12))
+    own = dict(settings=settings, data=tmp_path / "own")
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, **own)
+    with pytest.raises(ValueError, match=r"walker-walk has 6 actions.*\(12\)"):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, **own)
+
+
+def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_path):
+    with pytest.raises(ValueError, match=r"has 12 actions.*is 6: --set max_action_dim=12"):
+        plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch")

@@ -3,7 +3,7 @@
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -174,15 +174,39 @@ def make_plan(
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
     check_hyperparameters({**wpt_keywords(), **resolved.wpt})
-    find_tasks(suite, resolved.collect.tasks)
+    collected = find_tasks(suite, resolved.collect.tasks)
+    widths = {row.action_dim for row in collected}
     if data is not None:
-        TrajectoryDataset.open(data)
-    return [
+        widths = set(TrajectoryDataset.open(data).action_dims)
+    jobs = [
         Run(row, seed, method, preset, resolved, out, workers, device, data, tuple(settings))
         for row in rows
         for method in methods
         for seed in parse_seeds(seeds)
     ]
+    for job in jobs:
+        check_width(job, widths)
+    return jobs
+
+
+def check_width(job: Run, widths: Collection[int]) -> None:
+    """Refuses a task that the model cannot act in, or whose robot the data do not show.
+
+    :param widths: of the actions in the data
+    """
+    needed, wpt = job.task.action_dim, wpt_keywords() | job.wpt
+    if needed > wpt["max_action_dim"]:
+        raise ValueError(
+            f"{short_name(job.task)} has {needed} actions, the preset's max_action_dim is "
+            f"{wpt['max_action_dim']}: --set max_action_dim={needed}"
+        )
+    retrieves = wpt["offline_ratio"] > 0 or wpt["guidance"] not in (0, "0")
+    if METHODS[job.method].needs_data and retrieves and needed not in widths:
+        raise ValueError(
+            f"{short_name(job.task)} has {needed} actions, and nothing in the data has as many "
+            f"({', '.join(map(str, sorted(widths)))}): add such a task to collect.tasks (--set), "
+            "give --data that hold it, or use --method scratch or pretrain-only"
+        )
 
 
 def show_plan(jobs: Sequence[Run], force: bool) -> None:

@@ -60,3 +60,24 @@ def test_the_index_is_built_and_searched_at_the_size_asked_for():
     found = retrieval.index_cost(300, 8)
     assert found["features"] == "index of 300 x 8"
     assert 0 < found["of which imports"] <= found["peak MiB"]
+
+
+def test_every_row_of_the_retrieval_bench_is_made(tmp_path, monkeypatch):
+    with TrajectoryDataset.create(tmp_path / "data") as dataset:
+        for seed, task in enumerate(["wpt/dmc-walker-run-v0", "wpt/metaworld-soccer-v0"] * 2):
+            robot = "walker" if "walker" in task else "sawyer"
+            dataset.append(recorded(seed=seed, embodiment=robot, task=task))
+    asked = np.stack([dataset[i].image[0] for i in range(2)])
+    queries = retrieval.Queries(asked, dataset.tasks[:2])
+    monkeypatch.setattr(retrieval, "collect", lambda *_: dataset)
+    monkeypatch.setattr(retrieval, "fresh_queries", lambda *_: queries)
+    monkeypatch.setattr(retrieval, "FOLDER", tmp_path)
+    monkeypatch.setattr(retrieval, "MODEL", {**retrieval.MODEL, "size": "debug", "batch_length": 8})
+    for name, value in {"STEPS": 1, "NEAREST": 1, "PAPER": (300, 8)}.items():
+        monkeypatch.setattr(retrieval, name, value)
+    made = list(retrieval.rows())
+    assert [row["features"] for row in made] == [
+        *("pre-trained, 1 updates", "untrained, seed 0", "untrained, seed 1", "untrained, seed 2"),
+        *("raw pixels", "index of 300 x 8"),
+    ]
+    assert made[4]["own robot, DMControl"] == made[4]["own task, Meta-World"] == 1  # itself

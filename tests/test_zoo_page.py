@@ -80,9 +80,19 @@ def test_every_link_within_the_page_leads_somewhere(page):
 def test_our_numbers_stand_beside_the_papers(page):
     row = text(re.search(r"<tr><td>walker-run</td>.*?</tr>", page, re.S)[0])
     assert "730" in row and "728" in row  # ours, and Table 5's
-    assert "1,000 frames seeds 0, 1 0123456789ab" in row
     assert "100" in row  # scratch
     assert "Table 5: DMControl, return" in page and "Table 4" in page
+    assert "wpt ours: 1,000 frames, seeds 0, 1, commit 0123456789ab" in text(page)
+
+
+def test_budgets_seeds_and_commits_stand_in_the_cells_where_they_differ(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", 0)
+    for seed in range(2):
+        make_run(tmp_path, "dmc-cheetah-run", seed)
+    write_page(tmp_path, tmp_path / "index.html")
+    told = text((tmp_path / "index.html").read_text())
+    assert "1,000 frames, seeds 0, commit 0123456789ab" in told
+    assert "1,000 frames, seeds 0, 1, commit 0123456789ab" in told
 
 
 def test_tasks_that_were_not_run_are_folded_away(page):
@@ -102,7 +112,7 @@ def test_one_seed_has_no_interval_and_the_page_says_so(tmp_path):
     assert "0.73 to 0.73" not in told
     assert "1 of 22 1 0.73 no interval 0.73 no interval" in told
     assert "scratch 1.00 no interval 1" in told  # probability of improvement
-    assert "730 one seed: no interval 1,000 frames seeds 0" in told
+    assert "730 one seed: no interval" in told
     assert "One seed a task: no interval over seeds" in told
     assert "No run of the method" not in told
 

@@ -57,9 +57,8 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
     )  # fmt: skip
     encoders: dict[str, Embed] = {f"pre-trained, {STEPS} updates": trained.policy.embed}
     for seed in range(3):
-        encoders[f"untrained, seed {seed}"] = WPT(
-            "WPTPolicy", seed=seed, device="cpu", **MODEL
-        ).embed
+        untrained = WPT("WPTPolicy", seed=seed, device="cpu", **MODEL)
+        encoders[f"untrained, seed {seed}"] = untrained.policy.embed
     encoders["raw pixels"] = pixels
     for name, embed in encoders.items():
         yield {"features": name, **shares(dataset, embed, asked, NEAREST)}

@@ -243,11 +243,12 @@ def paper_table(
     columns = list(dict.fromkeys((row.method, row.samples) for row in reversed(printed)))
     row = partial(table_row, printed=printed, columns=columns, ours=ours, cells=cells)
     shown = {*(task for task, _ in cells), *STATISTICS}
+    rows = [row(task) for task in tasks if task in shown]
     return {
         "metric": "success rate" if printed[0].suite == "metaworld" else "return",
         "columns": [f"{BASELINES[method]} @ {samples_text(n)}" for method, n in columns],
-        "ours": ours,
-        "rows": [row(task) for task in tasks if task in shown],
+        "ours": {name: shared_about(rows, place) for place, name in enumerate(ours)},
+        "rows": rows,
         "not_run": [row(task) for task in tasks if task not in shown],
         "source": printed[0].source,
         "misprints": any(aggregates.misprint(row) is not None for row in printed),
@@ -276,6 +277,17 @@ def table_row(
     }
 
 
+def shared_about(rows: Sequence[Mapping[str, Any]], place: int) -> str:
+    """Budget, seeds and commits of a column of ours, taken out of its cells if all agree."""
+    cells = [cell for row in rows if (cell := row["ours"][place]) and cell["run"]]
+    told = {cell["about"] for cell in cells}
+    if len(told) > 1:
+        return ""
+    for cell in cells:
+        cell["about"] = ""
+    return told.pop() if told else ""
+
+
 def our_aggregate(name: str, tasks: Sequence[Sequence[Finished]]) -> dict[str, Any] | None:
     """The mean or median over tasks of each task's mean over seeds, in the table's units."""
     scores = [np.array([aggregates.score_of(run.result) for run in runs]) for runs in tasks]
@@ -292,6 +304,8 @@ def our_cell(runs: Sequence[Finished]) -> dict[str, Any] | None:
     if not runs:
         return None
     scores = [aggregates.score_of(run.result) for run in runs]
+    seeds = ", ".join(str(run.result["seed"]) for run in runs)
+    commits = ", ".join(sorted({run.result.get("commit") or "unknown" for run in runs}))
     middle, low, high = mean_interval(scores)
     if runs[0].result["metric"] == "success" and low is not None and high is not None:
         low, high = max(low, 0.0), min(high, 1.0)
@@ -299,7 +313,5 @@ def our_cell(runs: Sequence[Finished]) -> dict[str, Any] | None:
         "run": runs[0].name,
         "mean": middle,
         "interval": "one seed: no interval" if low is None else interval_text(low, high),
-        "seeds": [run.result["seed"] for run in runs],
-        "frames": runs[0].result["frames"],
-        "commits": sorted({run.result.get("commit") or "unknown" for run in runs}),
+        "about": f"{runs[0].result['frames']:,} frames, seeds {seeds}, commit {commits}",
     }

@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box, Dict
 from torch import nn
 
 from wpt_agents.networks import SIZES, Size
@@ -27,8 +30,8 @@ from wpt_agents.zoo.bench.model import (
     whole_step,
     world_model_step,
 )
+from wpt_agents.zoo.engines import import_extra
 
-INSTALL = {"sheeprl": "sheeprl==0.8.4", "torchrl": "torchrl==0.14.1 hydra-core"}
 REPETITIONS = 3
 HORIZON = 15  # imagined steps in the peers' own configurations
 
@@ -50,14 +53,16 @@ def rows(
 ) -> Iterator[dict[str, Any]]:
     """Ours and the peer's in turn, the world model's step and the whole update.
 
-    :raises ValueError: the peer is not installed, or fp32 is not what was asked for
+    :raises ValueError: the peer is not installed, or something but fp32 on a CPU was asked for
     """
     if precision != "fp32":
         raise ValueError(f"--peer measures in fp32, not in {precision}: leave --precision out")
+    if torch.cuda.is_available():
+        raise ValueError("--peer measures on a CPU: hide the GPU by CUDA_VISIBLE_DEVICES=-1")
     torch.set_num_threads(threads)
     size, batch, length = ("debug", 2, 8) if quick else ("small", 16, 64)
     data = synthetic_batch(batch, length)
-    learners = ours(agent(size), data), load(peer, SIZES[size], data)
+    learners = ours(agent(size), data), PEERS[peer](SIZES[size], data)
     about = {"size": size, "batch": batch, "length": length, "dtype": precision}
     for i, what in enumerate(("world model", "whole update")):
         cases = [
@@ -68,17 +73,6 @@ def rows(
         for one, row in zip(learners, found, strict=True):
             ratio = row["median_s"] / found[0]["median_s"]
             yield row | {"imagined": i * one.imagined, "ratio_to_ours": ratio}
-
-
-def load(name: str, size: Size, batch: Batch) -> Learner:
-    """The peer of this name, built as wide as `size`, about to learn from `batch`."""
-    try:
-        return PEERS[name](size, batch)
-    except ImportError as error:
-        raise ValueError(
-            f"--peer {name} needs {error.name}, which is not here. With torch kept as it is: "
-            f"pip install {INSTALL[name]} torch=={torch.__version__.split('+')[0]}"
-        ) from error
 
 
 def ours(model: WPT, batch: Batch) -> Learner:
@@ -92,6 +86,11 @@ def ours(model: WPT, batch: Batch) -> Learner:
     )
 
 
+def needed(name: str) -> ModuleType:
+    """A module of a peer, or of what it is made with."""
+    return import_extra(name, "peers")
+
+
 def count(*networks: nn.Module) -> int:
     """The parameters of the networks."""
     return sum(p.numel() for net in networks for p in net.parameters())
@@ -99,23 +98,19 @@ def count(*networks: nn.Module) -> int:
 
 def sheeprl(size: Size, batch: Batch) -> Learner:
     """Its `dreamer_v3`, the architecture of 2023, with its own training functions."""
-    import hydra
-    from lightning.fabric import Fabric
-    from sheeprl.algos.dreamer_v3 import dreamer_v3 as theirs
-    from sheeprl.algos.dreamer_v3.utils import Moments
-    from sheeprl.utils.metric import MetricAggregator
-
-    MetricAggregator.disabled = True  # no statistics for a log
-    cfg, fabric = sheeprl_config(size), Fabric(accelerator="cpu", devices=1)
+    theirs = needed("sheeprl.algos.dreamer_v3.dreamer_v3")
+    theirs.MetricAggregator.disabled = True  # no statistics for a log
+    cfg, fabric = sheeprl_config(size), theirs.Fabric(accelerator="cpu", devices=1)
     world, actor, critic, target, _ = theirs.build_agent(
-        fabric, (ACTIONS,), True, cfg, sheeprl_space()
+        fabric, (ACTIONS,), True, cfg, Dict({"rgb": Box(0, 255, (3, 64, 64), np.uint8)})
     )
     parts = (world, cfg.algo.world_model), (actor, cfg.algo.actor), (critic, cfg.algo.critic)
+    instantiate = needed("hydra.utils").instantiate
     optimizers = fabric.setup_optimizers(
-        *(hydra.utils.instantiate(c.optimizer, params=net.parameters()) for net, c in parts)
+        *(instantiate(c.optimizer, params=net.parameters()) for net, c in parts)
     )
     data, nets = sheeprl_batch(batch), (world, actor, critic, target)
-    rest = None, cfg, True, (ACTIONS,), Moments()
+    rest = None, cfg, True, (ACTIONS,), theirs.Moments()
     return Learner(
         f"sheeprl {version('sheeprl')}",
         (count(world), count(world, actor, critic)),
@@ -129,10 +124,6 @@ def sheeprl(size: Size, batch: Batch) -> Learner:
 
 def sheeprl_config(size: Size) -> Any:
     """Its defaults with our widths; two layers in the heads bring the count nearest to ours."""
-    from hydra import compose, initialize_config_module
-    from omegaconf import OmegaConf
-    from sheeprl.utils.utils import dotdict
-
     widths = {
         "dense_units": size.units,
         "mlp_layers": 2,
@@ -147,17 +138,11 @@ def sheeprl_config(size: Size) -> Any:
     }
     overrides = ["exp=dreamer_v3", "env=dummy", "algo.mlp_keys.encoder=[]"]
     overrides += [f"algo.{key}={value}" for key, value in widths.items()]
-    with initialize_config_module("sheeprl.configs", version_base="1.3"):
-        cfg = compose("config", overrides=overrides)
-    return dotdict(OmegaConf.to_container(cfg, resolve=True))
-
-
-def sheeprl_space() -> Any:
-    """One image, channels first."""
-    import numpy as np
-    from gymnasium import spaces
-
-    return spaces.Dict({"rgb": spaces.Box(0, 255, (3, 64, 64), np.uint8)})
+    hydra = needed("hydra")
+    with hydra.initialize_config_module("sheeprl.configs", version_base="1.3"):
+        cfg = hydra.compose("config", overrides=overrides)
+    plain = needed("omegaconf").OmegaConf.to_container(cfg, resolve=True)
+    return needed("sheeprl.utils.utils").dotdict(plain)
 
 
 def sheeprl_batch(batch: Batch) -> dict[str, torch.Tensor]:
@@ -174,9 +159,7 @@ def sheeprl_batch(batch: Batch) -> dict[str, torch.Tensor]:
 
 def torchrl(size: Size, batch: Batch) -> Learner:
     """The DreamerV3 of its `sota-implementations`, which its wheel brings along."""
-    from omegaconf import OmegaConf
-
-    cfg = OmegaConf.create(torchrl_config(size))
+    cfg = needed("omegaconf").OmegaConf.create(torchrl_config(size))
     with torchrl_example() as example, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         learner = example["_build_learner"](cfg, torch.device("cpu"), 0, ACTIONS, (3, 64, 64))
@@ -201,13 +184,12 @@ def torchrl(size: Size, batch: Batch) -> Learner:
 @contextmanager
 def torchrl_example() -> Iterator[dict[str, Any]]:
     """The names that its training script defines; its neighbours are importable meanwhile."""
-    import torchrl
-
-    folder = Path(torchrl.__file__).parents[1] / "sota-implementations" / "dreamer_v3"
+    library = needed("torchrl")
+    folder = Path(library.__file__).parents[1] / "sota-implementations" / "dreamer_v3"
     if not (folder / "train.py").exists():
         raise ValueError(
-            f"torchrl {torchrl.__version__} came without {folder.name}/train.py, the model and "
-            f"training step to measure; install one that has it: pip install {INSTALL['torchrl']}"
+            f"torchrl {version('torchrl')} came without {folder.name}/train.py, the model and "
+            'training step to measure; 0.14.1 has it: pip install "wpt-agents[peers]"'
         )
     sys.path.insert(0, str(folder))
     try:
@@ -254,10 +236,8 @@ def torchrl_config(size: Size) -> dict[str, Any]:
 
 def torchrl_batch(size: Size, batch: Batch) -> Any:
     """Its layout: an action beside the image that it led to, channels first."""
-    from tensordict import TensorDict
-
     shape, no = batch.reward.shape, torch.zeros_like(batch.is_first[..., None])
-    return TensorDict(
+    return needed("tensordict").TensorDict(
         {
             "state": torch.zeros(*shape, size.stoch * size.classes),
             "belief": torch.zeros(*shape, size.deter),

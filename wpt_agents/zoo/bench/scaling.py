@@ -16,17 +16,19 @@ from wpt_agents.zoo.bench.model import (
 )
 
 GRID = {  # what grows: cases of (size, batch, length)
-    "size": [(size, 16, 16) for size in ("debug", "tiny", "small", "medium")],
     "batch": [("tiny", batch, 16) for batch in (4, 8, 16, 32)],
     "length": [("tiny", 16, length) for length in (8, 16, 32, 64)],
+    "size": [(size, 16, 16) for size in ("debug", "tiny", "small", "medium")],
 }
 QUICK = {"batch": [("debug", batch, 4) for batch in (1, 2)]}
-UNITS = {"size": "GFLOP", "batch": "image", "length": "image", "environments": "action"}
+UNITS = {"batch": "image", "length": "image", "size": "GFLOP", "environments": "action"}
 
 
 def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
     """A row a case: `grows` says along which axis, `ms_per_unit` what a unit of work costs."""
     torch.set_num_threads(threads)
+    for row in policy.rows(quick, threads):
+        yield _per_unit(row, "environments", row["batch"])
     seen: dict[tuple, list[dict]] = {}
     for grows, cases in (QUICK if quick else GRID).items():
         for case in cases:
@@ -35,8 +37,6 @@ def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iter
             for row in seen[case]:
                 units = row["gflop"] if grows == "size" else row["batch"] * row["length"]
                 yield _per_unit(row, grows, units)
-    for row in policy.rows(quick, threads):
-        yield _per_unit(row, "environments", row["batch"])
 
 
 def _updates(

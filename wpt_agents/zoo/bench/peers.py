@@ -185,7 +185,7 @@ def torchrl(size: Size, batch: Batch) -> Learner:
 def torchrl_example() -> Iterator[dict[str, Any]]:
     """The names that its training script defines; its neighbours are importable meanwhile."""
     library = needed("torchrl")
-    folder = Path(library.__file__).parents[1] / "sota-implementations" / "dreamer_v3"
+    folder = Path(str(library.__file__)).parents[1] / "sota-implementations" / "dreamer_v3"
     if not (folder / "train.py").exists():
         raise ValueError(
             f"torchrl {version('torchrl')} came without {folder.name}/train.py, the model and "

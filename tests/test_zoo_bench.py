@@ -1,4 +1,5 @@
 import json
+import sys
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from typer.testing import CliRunner
 
 from wpt_agents.networks import FromPixel, UpConv
 from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.bench import command, policy, profile, replay, timing
+from wpt_agents.zoo.bench import command, policy, profile, replay, scaling, timing
 
 KEYS = {
     *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
@@ -63,6 +64,46 @@ def test_the_other_cases_yield_rows():
     assert every["count"] > sum(row["count"] for row in top) > 0
     shares = [row["share"] for row in top]
     assert shares == sorted(shares, reverse=True) and sum(shares) < 1
+
+
+def test_scaling_tells_the_cost_of_a_unit_and_draws_it(tmp_path):
+    picture = tmp_path / "growth.png"
+    arguments = ["bench", "scaling", "--quick", "--json", "--plot", str(picture)]
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0, ran.output
+    rows = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [row["grows"] for row in rows] == ["environments", *4 * ["batch"]]
+    for row in rows[1:]:
+        assert row["unit"] == "image"
+        images = row["batch"] * row["length"]
+        assert row["ms_per_unit"] == pytest.approx(1000 * row["median_s"] / images)
+    assert rows[0]["unit"] == "action"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_each_axis_of_the_grid_holds_all_else_equal():
+    for axis, cases in scaling.GRID.items():
+        position = ("size", "batch", "length").index(axis)
+        assert len({case[position] for case in cases}) == len(cases) > 2
+        assert len({case[:position] + case[position + 1 :] for case in cases}) == 1
+
+
+def test_the_memory_of_a_row_is_its_own():
+    def held(numbers):
+        timing.forget_peak()
+        before = timing.peak_rss_mb()
+        torch.ones(numbers)
+        return timing.peak_rss_mb() - before
+
+    big, small = held(64 * 2**18), held(2**18)  # 64 and 1 MB of float32
+    assert big > 60
+    if sys.platform == "linux":  # elsewhere the system does not forget
+        assert small < 20
+
+
+def test_every_row_tells_the_memory():
+    ran = CliRunner().invoke(app, ["bench", "profile", "--quick", "--json"])
+    assert all(json.loads(line)["rss_mb"] > 0 for line in ran.stdout.splitlines())
 
 
 def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):

@@ -8,14 +8,20 @@ import inspect
 import json
 from collections.abc import Iterator
 from enum import StrEnum
+from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import typer
 
 Case = StrEnum(
     "Case",
-    ["model", "profile", "policy", "replay", "data", "envs", "retrieval", "exploration", "all"],
+    [
+        *("model", "scaling", "profile", "policy", "replay", "data", "envs", "retrieval"),
+        *("exploration", "all"),
+    ],
 )
+Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])
 
 
@@ -27,6 +33,12 @@ def bench(
     ),
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
+    peer: Annotated[
+        Peer | None, typer.Option(help="Of model: this library's DreamerV3 beside ours instead.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Of scaling: draw what was measured into this file.")
+    ] = None,
 ) -> None:
     """Measures speed on this machine: medians after a warm-up.
 
@@ -36,26 +48,45 @@ def bench(
 
     Example: `python -m wpt_agents.zoo bench model --json > model.jsonl`
     """
-    options = {"quick": quick, "threads": threads, "precision": str(precision)}
+    if peer and case != Case.model:
+        raise ValueError(f"--peer goes with bench model, not with bench {case}")
+    if plot and case != Case.scaling:
+        raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
+    options = {"quick": quick, "threads": threads, "precision": str(precision), "peer": peer}
     for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
         try:
-            found = _rows(name, options)
-            if as_json:
-                for row in found:
-                    typer.echo(json.dumps({"case": str(name), **row}))
-            else:
-                _print_table(str(name), list(found))
+            module = importlib.import_module(f"wpt_agents.zoo.bench.{'peers' if peer else name}")
+            found = _show(str(name), _rows(module, options), as_json)
+            if plot:
+                module.plot(found, plot)
         except ImportError as error:
             if case != Case.all:
                 raise ValueError(f"bench {name} needs {error.name}, which is not here.") from error
             typer.echo(f"bench {name} left out: it needs {error.name}.", err=True)
 
 
-def _rows(name: str, options: dict[str, Any]) -> Iterator[dict]:
-    """What the module of a case yields, given the options that it takes."""
-    rows = importlib.import_module(f"wpt_agents.zoo.bench.{name}").rows
-    taken = inspect.signature(rows).parameters
-    return rows(**{key: value for key, value in options.items() if key in taken})
+def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
+    """What a case yields, given the options that it takes, and the memory that each row took."""
+    from wpt_agents.zoo.bench.timing import forget_peak, peak_rss_mb
+
+    taken = inspect.signature(module.rows).parameters
+    rows = module.rows(**{key: value for key, value in options.items() if key in taken})
+    forget_peak()
+    for row in rows:
+        yield row | {"rss_mb": row.get("rss_mb", peak_rss_mb())}
+        forget_peak()
+
+
+def _show(name: str, rows: Iterator[dict], as_json: bool) -> list[dict]:
+    """Prints the rows, as JSON each as soon as it is measured; returns them."""
+    found = []
+    for row in rows:
+        found.append(row)
+        if as_json:
+            typer.echo(json.dumps({"case": name, **row}))
+    if not as_json:
+        _print_table(name, found)
+    return found
 
 
 def _print_table(title: str, found: list[dict]) -> None:

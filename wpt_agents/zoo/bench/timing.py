@@ -1,11 +1,13 @@
 """Medians after a warm-up, counted work, and the ceiling of a large matmul beside them."""
 
+import ctypes
+import gc
 import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +23,22 @@ def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple
 
     :param warmup: calls that are not counted: memory is fetched and caches fill
     """
-    processor, wall = [], []
-    for i in range(warmup + repetitions):
-        before = time.process_time(), time.perf_counter()
-        step()
-        _wait()
-        if i >= warmup:
-            processor.append(time.process_time() - before[0])
-            wall.append(time.perf_counter() - before[1])
-    return statistics.median(processor), statistics.median(wall)
+    return seconds_in_turn([step], repetitions, warmup)[0]
+
+
+def seconds_in_turn(
+    steps: Sequence[Callable[[], Any]], repetitions: int, warmup: int = 1
+) -> list[tuple[float, float]]:
+    """`seconds` of several steps that take turns: what else the machine does befalls all alike."""
+    times: list[list[tuple[float, float]]] = [[] for _ in steps]
+    for _ in range(warmup + repetitions):
+        for step, found in zip(steps, times, strict=True):
+            before = time.process_time(), time.perf_counter()
+            step()
+            _wait()
+            found.append((time.process_time() - before[0], time.perf_counter() - before[1]))
+    counted = [zip(*found[warmup:], strict=True) for found in times]
+    return [(statistics.median(processor), statistics.median(wall)) for processor, wall in counted]
 
 
 def cost(processor: float, wall: float) -> float:
@@ -57,9 +66,17 @@ def gflop(step: Callable[[], Any]) -> float:
     A transposed convolution counts as its definition, not as the larger padded convolution that
     computes it here; what is not matmul or convolution counts nothing.
     """
-    with _by_definition(), FlopCounterMode(display=False) as counter:
+    counter = FlopCounterMode(display=False)
+    counter.mod_tracker = _Everything()  # its own walks through the modules, some of which mind
+    with _by_definition(), counter:
         step()
     return counter.get_total_flops() / 1e9
+
+
+class _Everything(nullcontext):
+    """Counts for the whole and for no module by itself."""
+
+    parents = ("Global",)
 
 
 @contextmanager
@@ -89,13 +106,25 @@ def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:
 
 
 def peak_rss_mb() -> float:
-    """The most memory that this process has held so far; not a number where nobody counts it."""
+    """The most memory that this process has held since `forget_peak`; not a number on Windows.
+
+    Where the system cannot forget (all but Linux) it is the most since the process began.
+    """
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:
         return float("nan")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def forget_peak() -> None:
+    """Starts `peak_rss_mb` anew, from what is in use now."""
+    gc.collect()
+    with suppress(OSError, AttributeError, TypeError):  # where there is no glibc
+        ctypes.CDLL(None).malloc_trim(0)  # what was freed and kept goes back to the system
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def resident_mb() -> float:

@@ -1,0 +1,84 @@
+"""How the cost of a unit of work grows with size, batch, length and the number of environments."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from wpt_agents.zoo.bench import policy
+from wpt_agents.zoo.bench.model import (
+    agent,
+    measured,
+    synthetic_batch,
+    whole_step,
+    world_model_step,
+)
+
+GRID = {  # what grows: cases of (size, batch, length)
+    "batch": [("tiny", batch, 16) for batch in (4, 8, 16, 32)],
+    "length": [("tiny", 16, length) for length in (8, 16, 32, 64)],
+    "size": [(size, 16, 16) for size in ("debug", "tiny", "small", "medium")],
+}
+QUICK = {"batch": [("debug", batch, 4) for batch in (1, 2)]}
+UNITS = {"batch": "image", "length": "image", "size": "GFLOP", "environments": "action"}
+
+
+def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
+    """A row a case: `grows` says along which axis, `ms_per_unit` what a unit of work costs."""
+    torch.set_num_threads(threads)
+    for row in policy.rows(quick, threads):
+        yield _per_unit(row, "environments", row["batch"])
+    seen: dict[tuple, list[dict]] = {}
+    for grows, cases in (QUICK if quick else GRID).items():
+        for case in cases:
+            if case not in seen:
+                seen[case] = list(_updates(*case, precision, 1 if quick else 3))
+            for row in seen[case]:
+                units = row["gflop"] if grows == "size" else row["batch"] * row["length"]
+                yield _per_unit(row, grows, units)
+
+
+def _updates(
+    size: str, batch: int, length: int, precision: str, repetitions: int
+) -> Iterator[dict]:
+    model = agent(size, precision)
+    data = synthetic_batch(batch, length).to(model.device)
+    steps = {"world model": world_model_step(model, data), "whole update": whole_step(model, data)}
+    for what, step in steps.items():
+        about = {"what": what, "size": size, "batch": batch, "length": length, "dtype": precision}
+        yield measured(step, about, repetitions)
+
+
+def _per_unit(row: dict[str, Any], grows: str, units: float) -> dict[str, Any]:
+    cost = 1e3 * row["median_s"] / units
+    return {"grows": grows, **row, "unit": UNITS[grows], "ms_per_unit": cost}
+
+
+def plot(found: list[dict[str, Any]], path: Path) -> None:
+    """A picture of `rows`: a panel an axis, a line for each kind of step; flat is proportional."""
+    from matplotlib.figure import Figure
+
+    axes = [name for name in UNITS if any(row["grows"] == name for row in found)]
+    figure = Figure(figsize=(3.4 * len(axes), 3.2), layout="constrained")
+    for name, panel in zip(axes, figure.subplots(1, len(axes), squeeze=False)[0], strict=True):
+        for label, points in _lines(found, name).items():
+            panel.plot(*zip(*points, strict=True), marker="o", label=label)
+        panel.set_xlabel({"size": "GFLOP an update"}.get(name, name))
+        panel.set_ylabel(f"ms per {UNITS[name]}")
+        panel.set_xscale("log", base=2)
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.set_ylim(bottom=0)
+        panel.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+
+
+def _lines(found: list[dict[str, Any]], name: str) -> dict[str, list[tuple[float, float]]]:
+    """The points of each line of a panel, from left to right."""
+    key = {"size": "gflop", "length": "length"}.get(name, "batch")
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for row in found:
+        if row["grows"] == name:
+            label = row["what"] if name != "environments" else row["size"]
+            lines.setdefault(label, []).append((row[key], row["ms_per_unit"]))
+    return {label: sorted(points) for label, points in lines.items()}

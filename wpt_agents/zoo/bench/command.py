@@ -14,7 +14,7 @@ import typer
 
 Case = StrEnum(
     "Case",
-    ["model", "profile", "policy", "replay", "data", "envs", "retrieval", "exploration", "all"],
+    "model profile policy replay data envs retrieval prediction exploration all".split(),
 )
 Precision = StrEnum("Precision", ["fp32", "bf16"])
 

@@ -140,11 +140,14 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("model.zip")}
     assert {path.parent.name for path in before} == {
         *("generalist", "specialist-walker", "specialist-cartpole"),
-        *("left-out", "adapted", "scratch"),
+        *("left-out", "left-out-2-then", "scratch-1"),
     }
     again = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--json"])
     assert [json.loads(line) for line in again.stdout.splitlines()] == rows
     assert {path: path.stat().st_mtime_ns for path in before} == before
+    fewer = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--updates", "1"])
+    assert isinstance(fewer.exception, ValueError)
+    assert "has had 2 updates, not 1" in str(fewer.exception)
 
 
 ROBOTS = ("walker", "cartpole")

@@ -27,6 +27,9 @@ def bench(
     ),
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
+    updates: Annotated[
+        int | None, typer.Option(min=1, help="Of each model, in the case prediction.")
+    ] = None,
 ) -> None:
     """Measures speed on this machine: medians of processor time after a warm-up.
 
@@ -34,7 +37,7 @@ def bench(
 
     Example: `python -m wpt_agents.zoo bench model --json > model.jsonl`
     """
-    options = {"quick": quick, "threads": threads, "precision": str(precision)}
+    options = dict(quick=quick, threads=threads, precision=str(precision), updates=updates)
     for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
         try:
             found = _rows(name, options)

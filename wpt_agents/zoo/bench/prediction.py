@@ -73,9 +73,14 @@ QUICK = Plan(
 )
 
 
-def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
-    """A row for each robot and way of predicting; draws `prediction.png` and `strips.png`."""
+def rows(quick: bool = False, updates: int | None = None) -> Iterator[dict[str, Any]]:
+    """A row for each robot and way of predicting; draws `prediction.png` and `strips.png`.
+
+    :param updates: of each world model, if not the plan's; more of them go on from fewer
+    """
     plan = QUICK if quick else FULL
+    if updates is not None:
+        plan = plan._replace(updates=updates, further=min(plan.further, updates))
     torch.set_num_threads(1)
     data = collect(
         plan.folder / "data", plan.tasks, plan.episodes, workers=1, behaviour=plan.behaviour,
@@ -116,14 +121,14 @@ def of(dataset: TrajectoryDataset, *robots: str) -> TrajectoryDataset:
 def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Predict]]:
     """By robot and name, what is compared; trains what is not trained yet."""
     robots = list(dict.fromkeys(str(robot) for robot in dataset.embodiments))
-    further = f"{plan.further} updates"
-    scratch = train(plan, "scratch", of(dataset, LEFT_OUT), plan.further)
+    told, scratch = f"{plan.further} updates", f"scratch-{plan.further}"
+    from_scratch = train(plan, scratch, of(dataset, LEFT_OUT), plan.further)
     generalist = train(plan, "generalist", dataset, plan.updates)
     untrained = WPT("WPTPolicy", seed=0, **plan.model)
     found: dict[str, dict[str, Predict]] = {}
     for robot in robots:
-        start = "scratch" if robot == LEFT_OUT else None  # its first updates are the same
         own = of(dataset, robot)
+        start = scratch if robot == LEFT_OUT else None  # its first updates are the same
         specialist = train(plan, f"specialist-{robot}", own, plan.updates, start)
         found[robot] = {
             "generalist": dream(generalist),
@@ -134,24 +139,38 @@ def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Pr
         }
     others = of(dataset, *(robot for robot in robots if robot != LEFT_OUT))
     zero_shot = train(plan, "left-out", others, plan.updates)
-    found[LEFT_OUT]["left out"] = dream(zero_shot)
-    adapted = train(plan, "adapted", of(dataset, LEFT_OUT), plan.updates + plan.further, "left-out")
-    found[LEFT_OUT][f"left out, then {further}"] = dream(adapted)
-    found[LEFT_OUT][f"from scratch, {further}"] = dream(scratch)
+    adapted = train(
+        plan, f"left-out-{plan.updates}-then", of(dataset, LEFT_OUT),
+        plan.updates + plan.further, "left-out",
+    )  # fmt: skip
+    found[LEFT_OUT] |= {
+        "left out": dream(zero_shot),
+        f"left out, then {told}": dream(adapted),
+        f"from scratch, {told}": dream(from_scratch),
+    }
     return found
 
 
 def train(
     plan: Plan, name: str, dataset: TrajectoryDataset, updates: int, start: str | None = None
 ) -> WPT:
-    """A world model after so many updates, of which those of the model `start` were the first."""
+    """A world model after so many updates, of which those of the model `start` were the first.
+
+    :raises ValueError: it has had more already
+    """
     file = plan.folder / name / "model.zip"
     if start is not None and not file.exists():
         with replacing(file) as temporary:
             copyfile(plan.folder / start / "model.zip", temporary)
-    return WPT.pretrain(
+    model = WPT.pretrain(
         dataset, steps=updates, seed=0, run_dir=file.parent, progress_bar=True, **plan.model
     )
+    if model.pretrain_steps > updates:
+        raise ValueError(
+            f"{file} has had {model.pretrain_steps} updates, not {updates}: give as many, or "
+            f"delete {plan.folder}"
+        )
+    return model
 
 
 def windows(trajectory: Trajectory, number: int, width: int) -> Batch:

@@ -1,5 +1,6 @@
 """The pictures of `bench prediction`: errors over the horizon, and strips of frames."""
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ import numpy as np
 matplotlib.use("Agg")  # no display
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
+from PIL import Image
 
 INK, MUTED = "#1f2933", "#8a94a0"
 # Okabe and Ito's colours, which the colour-blind tell apart; dashes help in print
@@ -75,7 +78,9 @@ def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
         axes.fill_between(at, curve.low[1:], curve.high[1:], color=given["color"], alpha=0.13, lw=0)
     axes.set(title=title, xlabel="steps ahead", ylabel="squared error an image", yscale="log")
     axes.set_xticks([1, 10, 20, 30, 40])
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(color="#e4e7eb", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -92,7 +97,9 @@ def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
         axes.tick_params(length=0, labelcolor=INK, labeltop=True, labelbottom=False)
         axes.set_title(strip.title)
         axes.spines[:].set_visible(False)
-    figure.savefig(path, dpi=110)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    Image.open(file).convert("RGB").quantize(256).save(path)  # a third of the bytes
     plt.close(figure)
 
 

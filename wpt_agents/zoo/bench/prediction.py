@@ -4,13 +4,13 @@ The error is that of Eq. (1): squared, summed over an image whose values lie in 
 models, errors and pictures are kept in `runs/bench/prediction`.
 """
 
+import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shutil import copyfile
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Generator
 
@@ -284,15 +284,11 @@ def typical(parts: Sequence[Batch]) -> Batch:
 
 def save(plan: Plan, curves: Sequence[Curve], shown: Sequence[Strip]) -> None:
     """Writes `prediction.csv`, with every horizon, and the two pictures."""
-    table = pd.concat(
-        pd.DataFrame(
-            {
-                **{"robot": c.robot, "prediction": c.prediction, "horizon": np.arange(HORIZON + 1)},
-                **{"error": c.error, "low": c.low, "high": c.high},
-            }
-        )
-        for c in curves
-    )
-    table.round(2).to_csv(plan.folder / "prediction.csv", index=False)
+    with open(plan.folder / "prediction.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(("robot", "prediction", "horizon", "error", "low", "high"))
+        for c in curves:
+            for horizon, values in enumerate(zip(c.error, c.low, c.high, strict=True)):
+                table.writerow((c.robot, c.prediction, horizon, *(f"{v:.2f}" for v in values)))
     draw_curves(plan.folder / "prediction.png", curves, LEFT_OUT)
     draw_strips(plan.folder / "strips.png", shown)

@@ -18,7 +18,7 @@ Case = StrEnum(
     "Case",
     [
         *("model", "scaling", "profile", "policy", "replay", "data", "envs", "retrieval"),
-        *("exploration", "all"),
+        *("prediction", "exploration", "all"),
     ],
 )
 Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
@@ -39,6 +39,9 @@ def bench(
     plot: Annotated[
         Path | None, typer.Option(help="Of scaling: draw what was measured into this file.")
     ] = None,
+    updates: Annotated[
+        int | None, typer.Option(min=1, help="Of each model, in the case prediction.")
+    ] = None,
 ) -> None:
     """Measures speed on this machine: medians after a warm-up.
 
@@ -52,7 +55,13 @@ def bench(
         raise ValueError(f"--peer goes with bench model, not with bench {case}")
     if plot and case != Case.scaling:
         raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
-    options = {"quick": quick, "threads": threads, "precision": str(precision), "peer": peer}
+    options: dict[str, Any] = {
+        "quick": quick,
+        "threads": threads,
+        "precision": str(precision),
+        "peer": peer,
+        "updates": updates,
+    }
     for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
         try:
             module = importlib.import_module(f"wpt_agents.zoo.bench.{'peers' if peer else name}")

@@ -1,0 +1,127 @@
+"""The pictures of `bench prediction`: errors over the horizon, and strips of frames."""
+
+import io
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")  # no display
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
+from PIL import Image
+
+INK, MUTED = "#1f2933", "#8a94a0"
+# Okabe and Ito's colours, which the colour-blind tell apart; dashes help in print
+STYLES: dict[str, dict[str, Any]] = {
+    "generalist": {"color": "#0072b2", "lw": 2.4},
+    "specialist": {"color": "#e69f00", "lw": 2.4},
+    "untrained": {"color": MUTED, "ls": ":", "lw": 1.6},
+    "copy last frame": {"color": "#000000", "ls": "--", "lw": 1.6},
+    "mean frame": {"color": "#cc79a7", "ls": "-.", "lw": 1.6},
+    "left out": {"color": "#d55e00", "lw": 2.4},
+    "left out, then": {"color": "#009e73", "lw": 2.4},
+    "from scratch": {"color": "#56b4e9", "lw": 2.4},
+}
+COMMON = tuple(STYLES)[:5]  # compared on every robot
+
+
+class Curve(NamedTuple):
+    """The error of one way of predicting on one robot, at the horizons 0, 1, ..."""
+
+    robot: str
+    prediction: str
+    error: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class Strip(NamedTuple):
+    """Rows of (N, 64, 64, 3) uint8 images by name, one column a horizon."""
+
+    title: str
+    images: Mapping[str, np.ndarray]
+    horizons: Sequence[int]
+
+
+def style(prediction: str) -> dict[str, Any]:
+    """The line of a way of predicting, by the longest name that it begins with."""
+    return STYLES[max((name for name in STYLES if prediction.startswith(name)), key=len)]
+
+
+def draw_curves(path: str | os.PathLike[str], curves: Sequence[Curve], left_out: str) -> None:
+    """A panel a robot, and one more for the robot that was left out of pre-training."""
+    robots = list(dict.fromkeys(curve.robot for curve in curves))
+    figure, panels = _grid(len(robots) + 1, (3.6, 2.9))
+    for axes, robot in zip(panels, robots, strict=False):
+        shown = [c for c in curves if c.robot == robot and c.prediction in COMMON]
+        _panel(axes, robot, shown)
+    own = [c for c in curves if c.robot == left_out]
+    own = [c for c in own if c.prediction not in COMMON or c.prediction == "copy last frame"]
+    axes = panels[len(robots)]
+    _panel(axes, f"{left_out}, left out of pre-training", own)
+    axes.legend(frameon=False, fontsize=8)
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=5, frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
+    for curve in curves:
+        given = style(curve.prediction)
+        at = np.arange(len(curve.error))[1:]
+        axes.plot(at, curve.error[1:], label=curve.prediction, **given)
+        axes.fill_between(at, curve.low[1:], curve.high[1:], color=given["color"], alpha=0.13, lw=0)
+    axes.set(title=title, xlabel="steps ahead", ylabel="squared error an image", yscale="log")
+    axes.set_xticks([1, 10, 20, 30, 40])
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="#e4e7eb", lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
+    """A block a strip: its rows are the ways of predicting, its columns the horizons."""
+    figure, panels = _grid(len(strips), (4.4, 2.75))
+    for axes, strip in zip(panels, strips, strict=False):
+        axes.imshow(montage(list(strip.images.values())), interpolation="nearest")
+        centres = [32 + 66 * i for i in range(max(len(strip.horizons), len(strip.images)))]
+        axes.set_xticks(centres[: len(strip.horizons)], [f"+{h}" for h in strip.horizons])
+        names = [name.replace(", then ", ",\nthen ") for name in strip.images]
+        axes.set_yticks(centres[: len(names)], names)
+        axes.tick_params(length=0, labelcolor=INK, labeltop=True, labelbottom=False)
+        axes.set_title(strip.title)
+        axes.spines[:].set_visible(False)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    Image.open(file).convert("RGB").quantize(256).save(path)  # a third of the bytes
+    plt.close(figure)
+
+
+def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:
+    """Rows of (N, H, W, 3) uint8 images as one picture, white between them."""
+    height, width = rows[0].shape[1:3]
+    columns = len(rows[0])
+    shape = len(rows) * (height + gap) - gap, columns * (width + gap) - gap, 3
+    picture = np.full(shape, 255, np.uint8)
+    for i, images in enumerate(rows):
+        for j, image in enumerate(images):
+            y, x = i * (height + gap), j * (width + gap)
+            picture[y : y + height, x : x + width] = image
+    return picture
+
+
+def _grid(panels: int, each: tuple[float, float]) -> tuple[Any, list[Axes]]:
+    """A figure of three panels a row; what is left over stays empty."""
+    height = -(-panels // 3)
+    figure, axes = plt.subplots(
+        height, 3, figsize=(3 * each[0], height * each[1]), layout="constrained", squeeze=False
+    )
+    for empty in axes.flat[panels:]:
+        empty.set_visible(False)
+    return figure, list(axes.flat)

@@ -1,5 +1,7 @@
 """The record of results: what stands in it, how it grows, what it says together."""
 
+from pathlib import Path
+
 import pytest
 from run_folders import make_run
 from typer.testing import CliRunner
@@ -76,6 +78,7 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
     assert found["wpt"]["dmc"][0] == 3 and found["wpt"]["mw"][1].mean == 90
     both = found["wpt"]["both"][1]
     assert (both.mean, both.low, both.high) == (45, 40, 50)
+    assert found["scratch, 3x frames"]["mw"][1].low is None  # of one seed
     assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
 
 
@@ -86,7 +89,15 @@ def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
     ran = CliRunner().invoke(app, ["report", str(tmp_path / "runs"), "--record", str(path)])
     assert ran.exit_code == 0, ran.output
     assert len(record.read(path)) == 8
-    assert "| dmc-walker-run | wpt | 1,000 | 40.0 (40.0 to 40.0), n=2 | 40.0 40.0 |" in (
+    assert "| dmc-walker-run | wpt | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 | 400 |" in (
         path.with_suffix(".md").read_text()
     )
     assert path.with_suffix(".png").stat().st_size > 1000
+
+
+def test_the_pages_table_is_the_records():
+    root = Path(__file__).parents[1]
+    lines = record.read(root / "zoo" / "results" / "small-benchmark.csv")
+    told = record.markdown(lines)
+    assert told in (root / "docs" / "small-benchmark.md").read_text()
+    assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()

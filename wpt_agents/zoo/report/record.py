@@ -157,7 +157,7 @@ class Cell:
 
     def __str__(self) -> str:
         around = f" ({interval_text(self.low, self.high)})" if self.low is not None else ""
-        return f"{number(self.mean)}{around}, n={len(self.scores)}"
+        return number(self.mean) + around
 
 
 Key = tuple[str, int]  # method, frames
@@ -208,28 +208,39 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, tup
 
 
 def _cell(strata: Sequence[np.ndarray], statistic: Any) -> Cell:
-    low, high = bootstrap(statistic, strata)
+    low = high = None
+    if any(len(stratum) > 1 for stratum in strata):  # else every draw is the same
+        low, high = map(float, bootstrap(statistic, strata))
     scores = tuple(float(s) for stratum in strata for s in stratum)
-    return Cell(scores, float(statistic(strata)), float(low), float(high))
+    return Cell(scores, float(statistic(strata)), low, high)
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """Every task and method of a record, then the suites."""
+    """Every task and method of a record, then the suites; no interval of single seeds."""
+    earned: dict[tuple[str, str, int], list[float]] = defaultdict(list)
+    for line in lines:
+        earned[line.task, line.method, line.frames].append(line.return_)
+    returns = {key: float(np.mean(values)) for key, values in earned.items()}
     rows = [
-        [task, method, f"{frames:,}", str(cell), " ".join(map(number, cell.scores))]
+        [
+            *(task, method, f"{frames:,}", str(cell), " ".join(map(number, cell.scores))),
+            number(returns[task, method, frames]),
+        ]
         for (_, task), methods in by_task(lines).items()
         for (method, frames), cell in methods.items()
     ]
-    headings = ("task", "method", "frames", "score (95 % interval by t)", "of each seed")
+    headings = ("task", "method", "frames", "score (95 % by t)", "of each seed", "mean return")
     suites = [
-        [suite, method, str(tasks), str(cell)]
+        [suite, method, str(tasks), str(len(cell.scores)), str(cell)]
         for method, means in by_suite(lines).items()
         for suite, (tasks, cell) in means.items()
     ]
     return (
         markdown_table(headings, rows)
         + "\n"
-        + markdown_table(("suite", "method", "tasks", "mean score (95 %, bootstrap)"), suites)
+        + markdown_table(
+            ("suite", "method", "tasks", "runs", "mean score (95 %, bootstrap)"), suites
+        )
     )
 
 

@@ -151,7 +151,7 @@ class Moved(gym.ObservationWrapper):
 @pytest.mark.parametrize("env", [Moved(ClockEnv()), VecTransposeImage(clocks())])
 def test_images_may_come_channels_first(env):
     with warnings.catch_warnings(action="error"):
-        model = agent(env).learn(14)
+        model = agent(env, offline_ratio=0, guidance=0).learn(14)
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
     evaluate_policy(model, env, 1, warn=False)
     ways = [

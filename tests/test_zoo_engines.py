@@ -88,7 +88,8 @@ def test_an_engine_that_is_not_installed_is_told_before_any_work(
     engine, module, monkeypatch, tmp_path, capsys
 ):
     monkeypatch.setitem(sys.modules, module, None)  # what a missing module looks like
-    words = ["run", "--tasks", "dot", "--preset", "debug", "--engine", engine]
+    words = ["run", "--tasks", "dot", "--method", "scratch", "--preset", "debug"]
+    words += ["--engine", engine]
     for also in ([], ["--dry-run"]):
         assert call(monkeypatch, *words, *also, "--out", tmp_path / "runs") == 2
         assert f'pip install "wpt-agents[{engine}]"' in capsys.readouterr().err

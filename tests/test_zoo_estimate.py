@@ -26,7 +26,8 @@ def test_no_room_is_told_before_any_work(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10, 9, 1))
     with pytest.raises(ValueError, match=r"0 MB free.*need about"):
         check_space([job(tmp_path)])
-    words = ["run", "--tasks", "dot", "--preset", "debug", "--out", tmp_path / "new"]
+    words = ["run", "--tasks", "dot", "--method", "scratch", "--preset", "debug"]
+    words += ["--out", tmp_path / "new"]
     assert call(monkeypatch, *words) == 2
     assert "make room" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

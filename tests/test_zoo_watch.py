@@ -72,8 +72,9 @@ def test_the_clock_shows_hours(seconds, text):
 
 
 def test_watching_ends_when_all_is_over_and_does_nothing_itself(tmp_path, monkeypatch, capsys):
-    words = ["--tasks", "dot", "--preset", "debug", "--out", tmp_path, "--watch"]
-    folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"
+    words = ["--tasks", "dot", "--method", "scratch", "--preset", "debug"]
+    words += ["--out", tmp_path, "--watch"]
+    folder = tmp_path / "debug" / "scratch" / "dmc-dot_0"
     folder.mkdir(parents=True)
     (folder / "error.txt").write_text("RuntimeError")
     assert call(monkeypatch, "run", *words) == 0

@@ -184,19 +184,33 @@ def test_processes_called_differently_are_refused(pair):
     assert "differ in steps, by rank: [6, 7]" in refused
 
 
-def test_torchrun_pretrains_by_the_command_line_and_only_rank_0_speaks(folder, tmp_path):
+def torchrun(*words):
+    """Two processes of it, and what they said; they must end well."""
     root = Path(__file__).parents[1]
     path = os.pathsep.join([str(root), str(root / "envs"), os.environ.get("PYTHONPATH", "")])
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    sizes = ["batch_size=2", "batch_length=4", "size=debug", "pretrain.steps=3"]
-    options = ["--data", folder / "data", "--out", tmp_path, "--preset", "debug", "--device", "cpu"]
+    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     done = subprocess.run(
-        [*torchrun, "-m", "wpt_agents.zoo", "pretrain", *options, "--set", *sizes],
+        [*start, *words],
         env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_processes_connect_again_after_they_parted_and_after_one_was_restarted():
+    said = torchrun("--max-restarts=1", Path(__file__).with_name("restarted.py")).stdout
+    for rank in range(2):
+        for meeting in range(2):
+            assert f"rank {rank}, attempt 1, meeting {meeting}" in said
+    assert "rank 1, attempt 0, meeting 1" not in said
+
+
+def test_torchrun_pretrains_by_the_command_line_and_only_rank_0_speaks(folder, tmp_path):
+    sizes = ["batch_size=2", "batch_length=4", "size=debug", "pretrain.steps=3"]
+    options = ["--data", folder / "data", "--out", tmp_path, "--preset", "debug", "--device", "cpu"]
+    done = torchrun("-m", "wpt_agents.zoo", "pretrain", *options, "--set", *sizes)
     said = [line.split()[0] for line in done.stdout.splitlines()]
     assert said == ["collect", "pretrain", "Model:"]
     [model] = (tmp_path / "cache").glob("model-*")

@@ -176,6 +176,13 @@ def test_retrieval_keeps_to_the_embodiment_when_the_data_names_it(store):
     assert model.retrieved_ids == [6]
 
 
+def test_a_robot_that_the_data_do_not_name_is_told_and_gets_any_of_its_width(store):
+    model = pretrained(store, env=DotEnv(), num_retrieve=9, embodiment="crab")
+    with pytest.warns(UserWarning, match=r"bears the name 'crab' \(dot, wide\).*of 2 actions"):
+        model.learn(1)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3]
+
+
 def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
     model = pretrained(store, num_retrieve=1)
     model.set_env(DotEnv())

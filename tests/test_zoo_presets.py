@@ -193,6 +193,22 @@ def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
         plan("dmc", ["walker-walk"], "demo", tmp_path, **own)
 
 
+def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
+    settings = ["collect.tasks=[dmc-quadruped-run, dmc-walker-walk]"]
+    with pytest.raises(ValueError, match=r"The data have 12 actions.*6: --set max_action_dim=12"):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, settings=settings)
+    assert plan("dmc", ["walker-walk"], "demo", tmp_path, "scratch", settings)
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [("retrieval=nearst", "nearest"), ("guidance=foo", "Schedule 'foo'"), ("size=tny", "tiny")],
+)
+def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, told, tmp_path):
+    with pytest.raises(ValueError, match=told):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, settings=[setting])
+
+
 def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_path):
     with pytest.raises(ValueError, match=r"has 12 actions.*is 6: --set max_action_dim=12"):
         plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch")

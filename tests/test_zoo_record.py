@@ -15,8 +15,8 @@ def lines_of(folder):
     return record.lines_of(find_finished(folder))
 
 
-def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc"):
-    return record.Line(suite, task, method, seed, frames, score, 0, None, 0, "c", "x")
+def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc", preset="tiny"):
+    return record.Line(suite, task, method, seed, preset, frames, score, 0, None, 0, "c", "x")
 
 
 def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
@@ -39,8 +39,11 @@ def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
 
 def test_data_of_ones_own_are_in_the_command():
     result = {"suite": "dmc", "task": "t", "method": "wpt", "seed": 0, "frames": 10}
-    told = record.command(result | {"preset": "tiny data=mine guidance=linear(1,0,9)"})
-    assert told.endswith("--data mine --set 'guidance=linear(1,0,9)'")
+    changes = "data=my/own 'collect.tasks=[a, b]' 'guidance=linear(1,0,9)'"
+    told = record.command(result | {"preset": f"tiny {changes}"})
+    assert told.endswith(
+        "--data my/own --set 'collect.tasks=[a, b]' --set 'guidance=linear(1,0,9)'"
+    )
 
 
 def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
@@ -58,8 +61,15 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
         *[("scratch", 3.0), ("wpt", 1.5), ("wpt", 9.0)]
     ]
     assert path.read_text().splitlines()[0] == (
-        "suite,task,method,seed,frames,score,return,success,hours,commit,command"
+        "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command"
     )
+
+
+def test_presets_are_kept_apart():
+    lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
+    assert len({each.run for each in lines}) == 3
+    assert set(record.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
+    assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record.markdown(lines)
 
 
 def test_another_csv_is_refused(tmp_path):
@@ -89,7 +99,7 @@ def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
     ran = CliRunner().invoke(app, ["report", str(tmp_path / "runs"), "--record", str(path)])
     assert ran.exit_code == 0, ran.output
     assert len(record.read(path)) == 8
-    assert "| dmc-walker-run | wpt | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 | 400 |" in (
+    assert "| dmc-walker-run | wpt | debug | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 | 400 |" in (
         path.with_suffix(".md").read_text()
     )
     assert path.with_suffix(".png").stat().st_size > 1000

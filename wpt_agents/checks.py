@@ -1,7 +1,7 @@
 """Refusals: what WPT cannot act in or learn from, each naming what came and what would do."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.guidance import parse_schedule
+from wpt_agents.names import unknown_name
+from wpt_agents.networks import SIZES
 from wpt_agents.trajectory import IMAGE_SIZE
 
 IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
@@ -19,26 +22,38 @@ COUNTS = (  # keywords of WPT that count something there must be one of
     *("num_retrieve", "bc_steps", "bc_batch_size"),
 )
 SHARES = ("gamma", "lam", "target_fraction", "unimix", "offline_ratio")
-SIZES = (  # and those that may be 0 but not less
+AMOUNTS = (  # and those that may be 0 but not less
     *("learning_rate", "actor_critic_learning_rate", "bc_learning_rate", "weight_decay"),
     *("grad_clip", "ent_coef", "dyn_scale", "rep_scale", "free_nats", "actor_outscale"),
     *("train_ratio", "learning_starts", "warmup_steps"),
 )
 
 
+CHOICES: dict[str, Collection[str]] = {
+    "size": SIZES,
+    "precision": ("fp32", "bf16"),
+    "free_nats_mode": ("mean", "element"),
+    "retrieval": ("nearest", "random"),
+}
+
+
 def check_hyperparameters(given: Mapping[str, Any]) -> None:
     """Refuses values of WPT's keywords that make no sense, each by name.
 
     :raises ValueError: a count that is no whole number from 1 on, a share outside [0, 1], something
-        else that is no number from 0 on
+        else that is no number from 0 on, an unknown choice or schedule
     """
     for name, value in given.items():
+        if name in CHOICES and value not in CHOICES[name]:
+            raise unknown_name(name, value, CHOICES[name])
+        if name == "guidance":
+            parse_schedule(value)
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if name in COUNTS and not (number and value >= 1 and value == int(value)):
             raise ValueError(f"{name} is a whole number from 1 on, got {value!r}")
         if name in SHARES and not (number and 0 <= value <= 1):
             raise ValueError(f"{name} is a share in [0, 1], got {value!r}")
-        if name in SIZES and value is not None and not (number and 0 <= value < np.inf):
+        if name in AMOUNTS and value is not None and not (number and 0 <= value < np.inf):
             raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import timedelta
+from itertools import count
 from typing import Any, TypeVar
 
 import torch
@@ -113,11 +114,27 @@ def joined(device: torch.device) -> Iterator[World]:
     gpu = device if device.type == "cuda" else None
     if gpu:
         torch.cuda.set_device(gpu)  # objects, too, are sent by way of it
-    dist.init_process_group("nccl" if gpu else "gloo", timeout=PATIENCE, device_id=gpu)
+    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
+    backend, store = "nccl" if gpu else "gloo", dist.PrefixStore(_meeting(), store)
+    dist.init_process_group(
+        backend, store=store, rank=rank, world_size=size, timeout=PATIENCE, device_id=gpu
+    )
     try:
         yield World.current()
     finally:
         dist.destroy_process_group()
+
+
+_meetings = count()
+
+
+def _meeting() -> str:
+    """A name of its own for each time that the processes connect.
+
+    Under another's name they would find the addresses of connections that are closed.
+    """
+    restarts = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    return f"wpt-{restarts}-{next(_meetings)}"
 
 
 def local_device(device: torch.device | str = "auto") -> torch.device:

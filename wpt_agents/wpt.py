@@ -13,7 +13,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -34,7 +34,6 @@ from wpt_agents.checks import check_dataset, check_hyperparameters, check_reward
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.importers.convert import Data
-from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
 from wpt_agents.pretraining import Pretraining
@@ -67,7 +66,8 @@ class WPT(Pretraining, BaseAlgorithm):
     :param size: the widths of all networks: debug, tiny, small, medium or paper
     :param dataset: D_off, for rehearsal and guidance: whatever `TrajectoryDataset.of` takes
     :param max_action_dim: A, the width that all actions are padded to
-    :param embodiment: the robot's name; retrieval keeps to data that bears it
+    :param embodiment: the robot's name; retrieval keeps to data that bears it or no name, and warns
+        if there is none
     :param batch_size: sequences in a batch
     :param batch_length: images in a sequence
     :param learning_rate: of world model and reward head; the size's own if None
@@ -156,9 +156,6 @@ class WPT(Pretraining, BaseAlgorithm):
     ) -> None:
         given = {k: v for k, v in locals().items() if k in HYPERPARAMETERS}
         self.hyperparameters = given
-        for name, valid in CHOICES.items():
-            if given[name] not in valid:
-                raise unknown_name(name, given[name], valid)
         check_hyperparameters(given)
         for name, value in given.items():
             setattr(self, name, value)
@@ -326,7 +323,15 @@ class WPT(Pretraining, BaseAlgorithm):
     def _search(self, query: np.ndarray, progress_bar: bool) -> list[int]:
         assert self.dataset is not None
         width, retriever = self.action_space.shape[0], self.build_index(progress_bar)
-        known = self.embodiment if self.embodiment in self.dataset.embodiments else None
+        names = set(self.dataset.embodiments)
+        known = self.embodiment if self.embodiment in names else None
+        if self.embodiment is not None and known is None and names != {None}:
+            there = ", ".join(sorted(name for name in names if name))
+            warnings.warn(
+                f"Nothing in the dataset bears the name {self.embodiment!r} ({there}): what is "
+                f"retrieved, rehearsed and cloned is of any robot of {width} actions",
+                stacklevel=4,
+            )
         if self.retrieval == "random":
             found = retriever.draw(self.num_retrieve, self._stream(RETRIEVE, 0), known, width)
         else:
@@ -472,11 +477,5 @@ class WPT(Pretraining, BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
 
-CHOICES: dict[str, Collection[str]] = {
-    "size": SIZES,
-    "precision": ("fp32", "bf16"),
-    "free_nats_mode": ("mean", "element"),
-    "retrieval": ("nearest", "random"),
-}
 KEYWORDS = set(inspect.signature(WPT.__init__).parameters) - {"self", "_init_setup_model"}
 HYPERPARAMETERS = KEYWORDS - {"policy", "env", "dataset", "tensorboard_log", "verbose", "device"}

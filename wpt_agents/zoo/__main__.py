@@ -153,7 +153,7 @@ def run_benchmark(
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
     from wpt_agents.distributed import started_by_torchrun
-    from wpt_agents.zoo.benchmark import run_all
+    from wpt_agents.zoo.benchmark import check_folder, run_all
     from wpt_agents.zoo.engines import Resources, run_on
     from wpt_agents.zoo.estimate import check_space, summary
     from wpt_agents.zoo.machine import check_machine
@@ -172,6 +172,8 @@ def run_benchmark(
         typer.echo(summary(jobs))
     check_machine(engine, device)
     check_space(jobs)
+    for job in jobs:
+        check_folder(job, force)
     if dry_run:
         return
     if engine == "none":

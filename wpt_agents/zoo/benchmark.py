@@ -117,12 +117,22 @@ def check_folder(job: Run, force: bool) -> None:
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
         before, wanted = yaml.safe_load(path.read_text()), json.loads(json.dumps(job.config()))
+        before, wanted = _flat(before), _flat(wanted)
         differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
         if differ:
             raise ValueError(
                 f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
                 "use another --out, or --force to replace it"
             )
+
+
+def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
+    """{'wpt': {'gamma': 1}} -> {'wpt.gamma': 1}."""
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        inner = value.items() if isinstance(value, dict) else None
+        flat |= {f"{name}.{k}": v for k, v in inner} if inner is not None else {name: value}
+    return flat
 
 
 class Clock:
@@ -162,7 +172,7 @@ def _work(job: Run) -> dict[str, Any]:
         if dataset is not None and checkpoint is None:  # else it has retrieved already
             with clock("index"):
                 job.shared.index(model)
-                if job.retrieves:
+                if job.retrieves and model.retrieval == "nearest":
                     picture = job.folder / "retrieval.png"
                     sheets.sheet_of_run(picture, model, job.task, job.shared.env, job.seed)
         clock.seconds["learn"] = round(_learn(job, model, checkpoint), 1)

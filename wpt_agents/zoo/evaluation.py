@@ -158,7 +158,10 @@ def evaluate(
     successes: list[bool] = []
     venv = make_vec_env(task, env, seed, episodes)
     steps = episode_steps(task, env)
-    with closing(venv), progress(steps and steps * episodes, f"evaluate {label}", "steps") as bar:
+    with (
+        closing(venv),
+        progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar,
+    ):
 
         def watch(local: dict[str, Any], _: dict[str, Any]) -> None:
             bar.update(1)

@@ -84,8 +84,8 @@ class Run:
     def label(self) -> str:
         """The preset's name and what was changed of it, but for `frames`, which stand apart."""
         changes = [c for c in self.changes if not c.startswith("learn.frames=")]
-        own_data = [f"data={self.data.name}"] if self.data is not None else []
-        return " ".join([self.preset_name, *sorted(changes), *own_data])
+        own_data = [f"data={self.data}"] if self.data is not None else []
+        return shlex.join([self.preset_name, *sorted(changes), *own_data])
 
     @property
     def folder(self) -> Path:
@@ -194,14 +194,15 @@ def check_width(job: Run, widths: Collection[int]) -> None:
 
     :param widths: of the actions in the data
     """
-    needed, wpt = job.task.action_dim, wpt_keywords() | job.wpt
-    if needed > wpt["max_action_dim"]:
+    needed, wpt, method = job.task.action_dim, wpt_keywords() | job.wpt, METHODS[job.method]
+    widest = max(needed, *widths) if method.needs_data else needed
+    if widest > wpt["max_action_dim"]:
+        whose = f"{short_name(job.task)} has" if needed == widest else "The data have"
         raise ValueError(
-            f"{short_name(job.task)} has {needed} actions, the preset's max_action_dim is "
-            f"{wpt['max_action_dim']}: --set max_action_dim={needed}"
+            f"{whose} {widest} actions, the preset's max_action_dim is "
+            f"{wpt['max_action_dim']}: --set max_action_dim={widest}"
         )
-    retrieves = wpt["offline_ratio"] > 0 or wpt["guidance"] not in (0, "0")
-    if METHODS[job.method].needs_data and retrieves and needed not in widths:
+    if job.retrieves and needed not in widths:
         raise ValueError(
             f"{short_name(job.task)} has {needed} actions, and nothing in the data has as many "
             f"({', '.join(map(str, sorted(widths)))}): add such a task to collect.tasks (--set), "

@@ -42,6 +42,10 @@ def report(
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows, policies = tables.summarise(results), tables.policies(results)
     as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
+    if record is not None:
+        lines = records.update(record, records.lines_of(find_finished(folder)))
+        record.with_suffix(".md").write_text(records.markdown(lines))
+        records.draw(record.with_suffix(".png"), lines)
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:
@@ -52,8 +56,4 @@ def report(
         page.with_name("report.md").write_text(as_markdown)
         page.with_name("policies.csv").write_text(tables.policy_csv(policies))
         console.print(tables.summary_table(rows))
-        if record is not None:
-            lines = records.update(record, records.lines_of(find_finished(folder)))
-            record.with_suffix(".md").write_text(records.markdown(lines))
-            records.draw(record.with_suffix(".png"), lines)
         console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")

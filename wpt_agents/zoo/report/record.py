@@ -42,6 +42,7 @@ class Line:
     task: str
     method: str
     seed: int
+    preset: str
     frames: int
     score: float
     return_: float
@@ -51,9 +52,9 @@ class Line:
     command: str
 
     @property
-    def run(self) -> tuple[str, str, int, int]:
+    def run(self) -> tuple[str, str, str, int, int]:
         """What no other line is of."""
-        return self.task, self.method, self.frames, self.seed
+        return self.task, self.method, self.preset, self.frames, self.seed
 
 
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
@@ -73,6 +74,7 @@ def _lines(result: Mapping[str, Any]) -> Iterator[Line]:
             result["task"],
             _method(policy, result["method"]),
             result["seed"],
+            "" if policy in UNTRAINED else result["preset"],
             0 if policy in UNTRAINED else result["frames"],
             round(100 * (score["mean"] / BEST_RETURN if success is None else success), 2),
             round(score["mean"], 2),
@@ -93,7 +95,7 @@ def _method(policy: str, method: str) -> str:
 
 def command(result: Mapping[str, Any]) -> str:
     """What does the run again, wherever it is typed."""
-    preset, *changes = result["preset"].split(" ")
+    preset, *changes = shlex.split(result["preset"])
     words = [*("python -m wpt_agents.zoo run --suite".split()), result["suite"]]
     words += ["--tasks", result["task"], "--method", result["method"], "--preset", preset]
     seed = result["seed"]
@@ -103,8 +105,8 @@ def command(result: Mapping[str, Any]) -> str:
     return shlex.join(words)
 
 
-def _order(line: Line) -> tuple[str, str, str, int, int]:
-    return line.suite, line.task, line.method, line.frames, line.seed
+def _order(line: Line) -> tuple[str, str, str, str, int, int]:
+    return line.suite, line.task, line.method, line.preset, line.frames, line.seed
 
 
 def update(path: Path, lines: Iterable[Line]) -> list[Line]:
@@ -160,14 +162,14 @@ class Cell:
         return number(self.mean) + around
 
 
-Key = tuple[str, int]  # method, frames
+Key = tuple[str, str, int]  # method, preset, frames
 
 
 def by_task(lines: Iterable[Line]) -> dict[tuple[str, str], dict[Key, Cell]]:
-    """(suite, task) -> (method, frames) -> its cell."""
+    """(suite, task) -> (method, preset, frames) -> its cell."""
     found: dict[tuple[str, str], dict[Key, list[float]]] = defaultdict(lambda: defaultdict(list))
     for line in lines:
-        found[line.suite, line.task][line.method, line.frames].append(line.score)
+        found[line.suite, line.task][line.method, line.preset, line.frames].append(line.score)
     return {
         task: {key: Cell.of(scores) for key, scores in methods.items()}
         for task, methods in found.items()
@@ -177,13 +179,20 @@ def by_task(lines: Iterable[Line]) -> dict[tuple[str, str], dict[Key, Cell]]:
 def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, tuple[int, Cell]]]:
     """Method -> suite -> its number of tasks and their mean score; "both" if there are two suites.
 
-    A method with another budget than wpt's on the suite bears it in its name: "scratch, 3x frames".
+    A method with another budget than wpt's on the suite bears it in its name: "scratch, 3x frames";
+    where wpt has several presets or budgets, its least one is taken, and the others bear them too.
     """
-    budget = {line.suite: line.frames for line in lines if line.method == "wpt"}
+    usual: dict[str, tuple[int, str]] = {}
+    for line in lines:
+        if line.method == "wpt":
+            here = line.frames, line.preset
+            usual[line.suite] = min(usual.get(line.suite, here), here)
     groups: dict[str, dict[str, dict[str, list[float]]]] = {}
     for line in lines:
-        ratio = line.frames / budget.get(line.suite, line.frames or 1)
+        frames, preset = usual.get(line.suite, (line.frames or 1, line.preset))
+        ratio = line.frames / frames
         name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
+        name += f", {line.preset}" if line.preset not in ("", preset) else ""
         suites = groups.setdefault(name, {})
         suites.setdefault(line.suite, defaultdict(list))[line.task].append(line.score)
     return {method: _means(suites) for method, suites in groups.items()}
@@ -196,7 +205,7 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, tup
     for suite, tasks in groups.items():
         strata[suite] = [np.array(scores) for scores in tasks.values()]
         found[suite] = len(tasks), _cell(strata[suite], mean)
-    if len(strata) > 1:
+    if len(strata) == 2:
         every = [scores for each in strata.values() for scores in each]
         ends = [0, *np.cumsum([len(each) for each in strata.values()])]
 
@@ -217,19 +226,27 @@ def _cell(strata: Sequence[np.ndarray], statistic: Any) -> Cell:
 
 def markdown(lines: Sequence[Line]) -> str:
     """Every task and method of a record, then the suites; no interval of single seeds."""
-    earned: dict[tuple[str, str, int], list[float]] = defaultdict(list)
+    earned: dict[tuple[str, str, str, int], list[float]] = defaultdict(list)
     for line in lines:
-        earned[line.task, line.method, line.frames].append(line.return_)
+        earned[line.task, line.method, line.preset, line.frames].append(line.return_)
     returns = {key: float(np.mean(values)) for key, values in earned.items()}
     rows = [
         [
-            *(task, method, f"{frames:,}", str(cell), " ".join(map(number, cell.scores))),
-            number(returns[task, method, frames]),
+            *(task, method, preset, f"{frames:,}", str(cell), " ".join(map(number, cell.scores))),
+            number(returns[task, method, preset, frames]),
         ]
         for (_, task), methods in by_task(lines).items()
-        for (method, frames), cell in methods.items()
+        for (method, preset, frames), cell in methods.items()
     ]
-    headings = ("task", "method", "frames", "score (95 % by t)", "of each seed", "mean return")
+    headings = (
+        "task",
+        "method",
+        "preset",
+        "frames",
+        "score (95 % by t)",
+        "of each seed",
+        "mean return",
+    )
     suites = [
         [suite, method, str(tasks), str(len(cell.scores)), str(cell)]
         for method, means in by_suite(lines).items()
@@ -254,11 +271,11 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
     )
     for panel, ((_, task), methods) in zip(panels.flat, tasks.items(), strict=False):
         shown = {key: cell for key, cell in methods.items() if not key[0].endswith("last")}
-        for at, ((method, _), cell) in enumerate(shown.items()):
+        for at, ((method, *_), cell) in enumerate(shown.items()):
             colour = "#0072b2" if method == "wpt" else "#777777"
             panel.plot(cell.scores, [at] * len(cell.scores), "o", ms=5, color=colour, alpha=0.7)
             panel.plot([cell.mean] * 2, [at - 0.3, at + 0.3], color=colour, lw=2)
-        panel.set_yticks(range(len(shown)), [method for method, _ in shown], fontsize=7.5)
+        panel.set_yticks(range(len(shown)), [method for method, *_ in shown], fontsize=7.5)
         panel.set(xlim=(-4, 104), title=task)
         panel.title.set_fontsize(9)
         panel.invert_yaxis()
@@ -266,7 +283,7 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
         panel.spines[["top", "right"]].set_visible(False)
     for panel in panels.flat[len(tasks) :]:
         panel.remove()
-    figure.supxlabel("score, 0 to 100; a dot a seed, the stroke their mean", fontsize=9)
+    figure.supxlabel("score, 0 to 100\na dot a seed, the stroke their mean", fontsize=9)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     plt.close(figure)

@@ -98,7 +98,7 @@ def test_every_method_runs(tmp_path, method):
     assert ("prior actor" in result["scores"]) == guided
     assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
     retrieved = (job(tmp_path, method).folder / "retrieval.png").exists()
-    assert retrieved == (method not in ("scratch", "pretrain-only"))
+    assert retrieved == (method not in ("scratch", "pretrain-only", "random-retrieval"))
 
 
 def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
@@ -164,7 +164,7 @@ def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
 
 def test_a_finished_run_of_other_settings_is_refused_before_any_work(tmp_path):
     run(job(tmp_path))
-    with pytest.raises(ValueError, match=r"other settings \(wpt\).*--out"):
+    with pytest.raises(ValueError, match=r"other settings \(wpt.gamma\).*--out"):
         benchmark.run_all([job(tmp_path, seed=1), job(tmp_path, wpt={"gamma": 0.5})])
     assert not job(tmp_path, seed=1).folder.exists()
 

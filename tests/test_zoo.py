@@ -372,6 +372,17 @@ def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys
     assert "1 of 1 run to do" in told.out and "--device cuda:99" in told.err
 
 
+def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "--preset", "debug", "--out", tmp_path]
+    folder = tmp_path / "debug" / "wpt" / "dmc-walker-run_0"
+    folder.mkdir(parents=True)
+    [one] = make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], [], tmp_path, 2, "auto")
+    (folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
+    assert call(monkeypatch, "run", *words, "--dry-run") == 0
+    assert call(monkeypatch, "run", *words, "--dry-run", "--set", "gamma=0.9") == 2
+    assert "other settings (wpt.gamma)" in capsys.readouterr().err
+
+
 def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
     assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0

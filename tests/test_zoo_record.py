@@ -105,6 +105,20 @@ def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
     assert path.with_suffix(".png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("form", ["--markdown", "--csv"])
+def test_a_record_is_kept_whatever_is_printed(tmp_path, form):
+    make_run(tmp_path / "runs", "dmc-walker-run")
+    path = tmp_path / "small.csv"
+    words = ["report", str(tmp_path / "runs"), form, "--record", str(path)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert len(record.read(path)) == 4
+
+
+def test_three_suites_have_no_mean_of_both():
+    lines = [line("wpt", 1.0, task=suite, suite=suite) for suite in ("dmc", "mw", "robotics")]
+    assert set(record.by_suite(lines)["wpt"]) == {"dmc", "mw", "robotics"}
+
+
 def test_the_pages_table_is_the_records():
     root = Path(__file__).parents[1]
     lines = record.read(root / "zoo" / "results" / "small-benchmark.csv")

@@ -8,8 +8,10 @@ from torch import nn
 from typer.testing import CliRunner
 
 from wpt_agents.networks import FromPixel, UpConv
+from wpt_agents.wpt import WPT
 from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.bench import command, policy, profile, replay, scaling, timing
+from wpt_agents.zoo.bench import command, policy, profile, replay, scaling, timing, work
+from wpt_agents.zoo.bench import model as bench_model
 
 KEYS = {
     *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
@@ -56,8 +58,9 @@ def test_one_thread_counts_processor_time_and_several_wall_clock(monkeypatch):
 
 
 def test_the_other_cases_yield_rows():
-    (acting,) = policy.rows(quick=True)
-    assert acting["batch"] == 1 and acting["median_s"] > 0
+    acting = list(policy.rows(quick=True))
+    assert [row["what"] for row in acting] == ["policy step", "policy step, by definition"]
+    assert all(row["batch"] == 1 and row["median_s"] > 0 for row in acting)
     (sampling,) = replay.rows(quick=True)
     assert sampling["image_mb"] == pytest.approx(3 * 501 * 64 * 64 * 3 / 2**20)
     every, *top = profile.rows(quick=True)
@@ -125,3 +128,26 @@ def test_a_table_shortens_nothing(monkeypatch, capsys):
     joined = "".join(c for c in told if c.isalnum() or c in "-_")
     assert max(map(len, told.splitlines())) <= 60 and "…" not in told
     assert all(part in joined for part in ("button-press", "wall", "heading"))
+
+
+def test_acting_by_definition_is_measured_by_the_definition():
+    agent = WPT(size="debug", max_action_dim=2, seed=0)
+    quick, seen = agent.policy._stepper(), []
+    policy.defined(agent.policy, lambda: seen.append(agent.policy._stepper()))
+    assert seen == [agent.policy.step] and agent.policy._stepper() is quick
+
+
+def test_calls_are_of_operators_that_compute():
+    x = torch.ones(2, 3, requires_grad=True)
+    assert work.launches(lambda: x.t()[0].unsqueeze(0)) == 0
+    assert work.launches(lambda: (x * 2) + 1) == 2
+    assert work.launches(lambda: (x * 2).sum().backward()) > 3
+
+
+def test_the_work_of_a_batch_is_counted_on_a_part_of_it():
+    rows = list(work.rows(quick=True))
+    assert [row["what"] for row in rows] == ["world model", "whole update"]
+    model = bench_model.agent("debug")
+    step = bench_model.world_model_step(model, bench_model.synthetic_batch(2, 8))
+    assert rows[0]["tflop"] == pytest.approx(timing.gflop(step) * 64 / 1e3, rel=0.02)
+    assert rows[1]["operator_calls"] > rows[0]["operator_calls"] > 100

@@ -1,6 +1,7 @@
 """Execution guidance: how often, and for which steps of an episode, the prior actor drives."""
 
 import re
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -40,6 +41,11 @@ def parse_schedule(text: str | float) -> Schedule:
         f"Schedule {text!r} is not understood: write a probability, or 'linear(start,end,steps)' "
         "of two probabilities and steps > 0, for example 'linear(1,0,50000)'"
     )
+
+
+def ever(schedule: Schedule) -> bool:
+    """Whether it is ever above 0; schedules are monotonous."""
+    return schedule(0) > 0 or schedule(sys.maxsize) > 0
 
 
 def draw_window(probability: float, length: int, rng: np.random.Generator) -> tuple[int, int]:

@@ -32,7 +32,7 @@ from tqdm.auto import tqdm
 from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_hyperparameters, check_rewards, check_spaces
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.guidance import draw_window, parse_schedule
+from wpt_agents.guidance import draw_window, ever, parse_schedule
 from wpt_agents.importers.convert import Data
 from wpt_agents.networks import SIZES
 from wpt_agents.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
@@ -422,8 +422,8 @@ class WPT(Pretraining, BaseAlgorithm):
         return getattr(spec, "max_episode_steps", None) or 500
 
     def _guided(self) -> bool:
-        """Whether the prior actor will ever drive: schedules are monotonous."""
-        return self.schedule(0) > 0 or self.schedule(sys.maxsize) > 0
+        """Whether the prior actor will ever drive."""
+        return ever(self.schedule)
 
     def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
         if self.cloned:

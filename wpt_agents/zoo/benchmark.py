@@ -116,8 +116,8 @@ def check_folder(job: Run, force: bool) -> None:
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
-        before, wanted = yaml.safe_load(path.read_text()), json.loads(json.dumps(job.config()))
-        before, wanted = _flat(before), _flat(wanted)
+        before = _flat(yaml.safe_load(path.read_text()))
+        wanted = _flat(json.loads(json.dumps(job.config())))
         differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
         if differ:
             raise ValueError(
@@ -130,8 +130,8 @@ def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
     """{'wpt': {'gamma': 1}} -> {'wpt.gamma': 1}."""
     flat: dict[str, Any] = {}
     for name, value in config.items():
-        inner = value.items() if isinstance(value, dict) else None
-        flat |= {f"{name}.{k}": v for k, v in inner} if inner is not None else {name: value}
+        sections = isinstance(value, dict)
+        flat |= {f"{name}.{k}": v for k, v in value.items()} if sections else {name: value}
     return flat
 
 

@@ -122,11 +122,9 @@ def make_vec_env(
 
     :param monitor: the file of its episodes, which is continued if it is there
     """
-    before = Path(monitor).read_text() if monitor is not None and Path(monitor).exists() else ""
-    row, anew = wpt_envs.TASKS.get(task), not before
-    successes = row is not None and row.metric == "success"
-    # a file that an earlier version began keeps its columns
-    told = ("is_success",) if successes and (anew or "is_success" in before) else ()
+    anew = monitor is None or not Path(monitor).exists()
+    row = wpt_envs.TASKS.get(task)
+    told = ("is_success",) if row is not None and row.metric == "success" else ()
 
     def make() -> gym.Env:
         made = EpisodeSeeds(gym.make(task, **env))

@@ -14,6 +14,7 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.checks import check_hyperparameters
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.guidance import ever, parse_schedule
 from wpt_agents.names import counted, unknown_name
 from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
 from wpt_agents.zoo.stages import Shared, console
@@ -108,7 +109,8 @@ class Run:
     def retrieves(self) -> bool:
         """Whether trajectories are retrieved, for rehearsal or for guidance."""
         wpt = wpt_keywords() | self.wpt
-        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or wpt["guidance"])
+        guided = ever(parse_schedule(wpt["guidance"]))
+        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or guided)
 
     @property
     def updates(self) -> int:

@@ -17,7 +17,7 @@ import typer
 Case = StrEnum(
     "Case",
     [
-        *("model", "scaling", "profile", "policy", "replay", "data", "envs", "retrieval"),
+        *("model", "scaling", "profile", "work", "policy", "replay", "data", "envs", "retrieval"),
         *("prediction", "exploration", "all"),
     ],
 )

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from wpt_agents.trajectory import Batch
 from wpt_agents.updates import UPDATE
@@ -29,28 +29,34 @@ CASES = (  # size, batch, length; `bench scaling` shows what grows with each
 def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
     """One row a case; `quick` takes the debug size and one repetition."""
     torch.set_num_threads(threads)
-    for size, batch, length in (("debug", 2, 8),) if quick else CASES:
-        model = agent(size, precision)
-        data = synthetic_batch(batch, length).to(model.device)
-        about = {"size": size, "batch": batch, "length": length, "dtype": precision}
-        networks = model.policy.world_model, model.policy.actor, model.policy.critic
-        params = [sum(p.numel() for p in net.parameters()) for net in networks]
-        for what, step, count in (
-            ("world model", world_model_step(model, data), params[0]),
-            ("whole update", whole_step(model, data), sum(params)),
-        ):
-            yield measured(step, about | {"what": what, "params": count}, 1 if quick else 3)
+    for case in (("debug", 2, 8),) if quick else CASES:
+        yield from updates(*case, precision, 1 if quick else 3)
 
 
-def measured(step: Callable[[], Any], about: dict[str, Any], repetitions: int) -> dict[str, Any]:
-    """A row: time, work and memory of a step, and the ceiling right before and after it."""
-    return measured_in_turn([(step, about)], repetitions)[0]
+def updates(
+    size: str, batch: int, length: int, precision: str, repetitions: int
+) -> Iterator[dict[str, Any]]:
+    """A row for the world model's step, and one for the whole update."""
+    model = agent(size, precision)
+    data = synthetic_batch(batch, length).to(model.device)
+    about = {"size": size, "batch": batch, "length": length, "dtype": precision}
+    networks = model.policy.world_model, model.policy.actor, model.policy.critic
+    for what, step, params in (
+        ("world model", world_model_step(model, data), count(networks[0])),
+        ("whole update", whole_step(model, data), count(*networks)),
+    ):
+        yield from measured_in_turn([(step, about | {"what": what, "params": params})], repetitions)
+
+
+def count(*networks: nn.Module) -> int:
+    """The parameters of the networks."""
+    return sum(p.numel() for net in networks for p in net.parameters())
 
 
 def measured_in_turn(
     cases: Sequence[tuple[Callable[[], Any], dict[str, Any]]], repetitions: int
 ) -> list[dict[str, Any]]:
-    """A row for each of several steps, which take turns."""
+    """A row for each of several steps, which take turns: time, work, memory, and the ceiling."""
     steps = [step for step, _ in cases]
     held = [_peak_mb(step) for step in steps]
     work = [gflop(step) for step in steps]

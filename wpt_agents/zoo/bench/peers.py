@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
-from torch import nn
 
 from wpt_agents.networks import SIZES, Size
 from wpt_agents.trajectory import Batch
@@ -25,6 +24,7 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.model import (
     ACTIONS,
     agent,
+    count,
     measured_in_turn,
     synthetic_batch,
     whole_step,
@@ -42,7 +42,7 @@ class Learner(NamedTuple):
     The first of two is the world model's with the reward head, the second the whole update.
     """
 
-    library: str
+    name: str
     params: tuple[int, int]
     imagined: int  # steps from each state of the batch
     steps: tuple[Callable[[], Any], Callable[[], Any]]
@@ -66,7 +66,7 @@ def rows(
     about = {"size": size, "batch": batch, "length": length, "dtype": precision}
     for i, what in enumerate(("world model", "whole update")):
         cases = [
-            (one.steps[i], {"library": one.library, "what": what, **about, "params": one.params[i]})
+            (one.steps[i], about | {"library": one.name, "what": what, "params": one.params[i]})
             for one in learners
         ]
         found = measured_in_turn(cases, 1 if quick else REPETITIONS)
@@ -89,11 +89,6 @@ def ours(model: WPT, batch: Batch) -> Learner:
 def needed(name: str) -> ModuleType:
     """A module of a peer, or of what it is made with."""
     return import_extra(name, "peers")
-
-
-def count(*networks: nn.Module) -> int:
-    """The parameters of the networks."""
-    return sum(p.numel() for net in networks for p in net.parameters())
 
 
 def sheeprl(size: Size, batch: Batch) -> Learner:

@@ -1,41 +1,55 @@
 """One step of acting: images to actions, one environment or several at once."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
-from wpt_agents.policy import State
-from wpt_agents.zoo.bench.model import agent
-from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds
+from wpt_agents.policy import WPTPolicy
+from wpt_agents.zoo.bench.model import agent, count
+from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds_in_turn
 
 
 def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
-    """One row a size and number of environments; params are those that acting uses."""
+    """A row a size, number of environments and form; params are those that acting uses.
+
+    The definition, `WPTPolicy.step`, and on a CPU the quick form of it take turns.
+    """
     torch.set_num_threads(threads)
     sizes, counts = (("debug",), (1,)) if quick else (("tiny", "small", "medium"), (1, 4, 16))
     for size in sizes:
         policy = agent(size).policy
-        rssm, encoder = policy.world_model.rssm, policy.world_model.encoder
-        params = sum(p.numel() for net in (encoder, rssm, policy.actor) for p in net.parameters())
+        params = count(policy.world_model.encoder, policy.world_model.rssm, policy.actor)
         for n in counts:
             image = np.random.default_rng(0).integers(0, 256, (n, 64, 64, 3)).astype(np.uint8)
-            state: State = policy.initial_state(n)
-            first = np.zeros(n, bool)
-
-            def step() -> None:
-                nonlocal state
-                _, state = policy.act(image, state, first)  # noqa: B023  # called at once
-
-            processor, wall = seconds(step, 3 if quick else 200, warmup=1 if quick else 20)
-            yield {
-                "what": "policy step",
-                "size": size,
-                "params": params,
-                "batch": n,
-                "threads": threads,
-                "dtype": "fp32",
-                "median_s": cost(processor, wall),
-                "wall_s": wall,
-                "rss_mb": peak_rss_mb(),
+            state, first = policy.initial_state(n), np.zeros(n, bool)
+            act = partial(policy.act, image, state, first)
+            forms = {
+                "policy step": act,
+                "policy step, by definition": partial(defined, policy, act),
             }
+            repetitions, warmup = (3, 1) if quick else (200, 20)
+            times = seconds_in_turn(list(forms.values()), repetitions, warmup)
+            for what, (processor, wall) in zip(forms, times, strict=True):
+                yield {
+                    "what": what,
+                    "size": size,
+                    "params": params,
+                    "batch": n,
+                    "threads": threads,
+                    "dtype": "fp32",
+                    "median_s": cost(processor, wall),
+                    "wall_s": wall,
+                    "rss_mb": peak_rss_mb(),
+                }
+
+
+def defined(policy: WPTPolicy, act: Callable[[], Any]) -> None:
+    """Acts by `WPTPolicy.step`."""
+    policy._stepper = lambda: policy.step  # type: ignore[method-assign]
+    try:
+        act()
+    finally:
+        del policy._stepper

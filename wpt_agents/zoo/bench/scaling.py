@@ -7,13 +7,7 @@ from typing import Any
 import torch
 
 from wpt_agents.zoo.bench import policy
-from wpt_agents.zoo.bench.model import (
-    agent,
-    measured,
-    synthetic_batch,
-    whole_step,
-    world_model_step,
-)
+from wpt_agents.zoo.bench.model import updates
 
 GRID = {  # what grows: cases of (size, batch, length)
     "batch": [("tiny", batch, 16) for batch in (4, 8, 16, 32)],
@@ -28,26 +22,17 @@ def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iter
     """A row a case: `grows` says along which axis, `ms_per_unit` what a unit of work costs."""
     torch.set_num_threads(threads)
     for row in policy.rows(quick, threads):
+        if row["what"] != "policy step":
+            continue
         yield _per_unit(row, "environments", row["batch"])
     seen: dict[tuple, list[dict]] = {}
     for grows, cases in (QUICK if quick else GRID).items():
         for case in cases:
             if case not in seen:
-                seen[case] = list(_updates(*case, precision, 1 if quick else 3))
+                seen[case] = list(updates(*case, precision, 1 if quick else 3))
             for row in seen[case]:
                 units = row["gflop"] if grows == "size" else row["batch"] * row["length"]
                 yield _per_unit(row, grows, units)
-
-
-def _updates(
-    size: str, batch: int, length: int, precision: str, repetitions: int
-) -> Iterator[dict]:
-    model = agent(size, precision)
-    data = synthetic_batch(batch, length).to(model.device)
-    steps = {"world model": world_model_step(model, data), "whole update": whole_step(model, data)}
-    for what, step in steps.items():
-        about = {"what": what, "size": size, "batch": batch, "length": length, "dtype": precision}
-        yield measured(step, about, repetitions)
 
 
 def _per_unit(row: dict[str, Any], grows: str, units: float) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from contextlib import closing
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +21,7 @@ from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo import benchmark, stages
 from wpt_agents.zoo.benchmark import run
-from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate
+from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate, make_vec_env
 from wpt_agents.zoo.plan import METHODS, Run, make_plan
 from wpt_agents.zoo.presets import Preset
 from wpt_agents.zoo.report import tables

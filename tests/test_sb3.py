@@ -86,6 +86,50 @@ def test_it_learns_in_a_subproc_vec_env(n):
     assert same(weights(model), weights(in_one_process))
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_updates_beside_the_steps_of_a_process_learn_what_they_learn_in_one():
+    worker = SubprocVecEnv([DotEnv], start_method="fork")
+    try:
+        beside = agent(worker, train_freq="step").learn(3 * LENGTH)
+    finally:
+        worker.close()
+    alone = agent(DummyVecEnv([DotEnv]), train_freq="step").learn(3 * LENGTH)
+    assert same(weights(beside), weights(alone)) and beside.updates == alone.updates > 0
+    assert not same(weights(agent(DummyVecEnv([DotEnv])).learn(3 * LENGTH)), weights(alone))
+
+
+def test_updates_of_every_step_are_as_many_as_those_of_every_episode(monkeypatch):
+    made, update = [], WPT.update
+
+    def noted(model, metrics):
+        made.append(model.num_timesteps)
+        update(model, metrics)
+
+    monkeypatch.setattr(WPT, "update", noted)
+    agent(DotEnv(), train_freq="step", train_ratio=4).learn(3 * LENGTH)
+    by_step, made[:] = list(made), []
+    agent(DotEnv(), train_ratio=4).learn(3 * LENGTH)
+    assert len(by_step) == len(made) and set(made) <= {LENGTH, 2 * LENGTH, 3 * LENGTH}
+    assert len(set(by_step)) > LENGTH
+
+
+def test_a_step_whose_updates_fail_is_not_taken_for_the_next(monkeypatch):
+    worker = SubprocVecEnv([ClockEnv] * 2)
+    try:
+        model = agent(worker, train_freq="step")
+        with monkeypatch.context() as patch, pytest.raises(FloatingPointError):
+            patch.setattr(WPT, "_descend", not_finite)
+            model.learn(100)
+        model.learn(28, reset_num_timesteps=False)
+    finally:
+        worker.close()
+    assert all(on_time(t) for t in model.replay_buffer.trajectories)
+
+
+def not_finite(*_):
+    raise FloatingPointError
+
+
 def test_a_worker_that_dies_is_told_and_learning_goes_on_in_new_ones():
     env = SubprocVecEnv([DotEnv] * 2)  # forked workers would hold each other's pipes open: no end
     model, killer = agent(env), KillWorker(env.processes[1], step=2 * LENGTH + 10)

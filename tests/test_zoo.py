@@ -4,6 +4,7 @@ import csv
 import io
 import json
 from contextlib import closing
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,7 @@ from rich.console import Console
 from run_folders import make_run
 from scipy import stats
 from stable_baselines3.common.results_plotter import load_results, ts2xy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from wpt_envs.tasks import TASKS, Task
 from zoo_command import call
 
@@ -99,6 +101,36 @@ def test_every_method_runs(tmp_path, method):
     assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
     retrieved = (job(tmp_path, method).folder / "retrieval.png").exists()
     assert retrieved == (method not in ("scratch", "pretrain-only", "random-retrieval"))
+
+
+def test_an_environment_beside_the_learner_changes_nothing_but_the_time(tmp_path, monkeypatch):
+    made, before = [], benchmark.make_vec_env
+    monkeypatch.setattr(
+        benchmark, "make_vec_env", lambda *a, **k: made.append(before(*a, **k)) or made[-1]
+    )
+    reach, scores = TASKS["wpt/metaworld-reach-v0"], []
+    wpt = {"train_freq": "step", "max_action_dim": 4, "train_ratio": 1}
+    for overlap in (True, False):
+        one = job(
+            tmp_path / str(overlap),
+            "scratch",
+            env={"action_repeat": 2},
+            learn={"frames": 400, "overlap": overlap},
+            evaluate={"episodes": 1},
+            wpt=wpt,
+        )
+        scores.append(run(replace(one, task=reach))["scores"])
+    assert [type(venv) for venv in made] == [SubprocVecEnv, DummyVecEnv]
+    assert scores[0] == scores[1]
+    beside, alone = (
+        next((tmp_path / str(overlap)).rglob("progress.csv")) for overlap in (True, False)
+    )
+    assert _without_times(beside) == _without_times(alone) != []
+
+
+def _without_times(path):
+    rows = csv.DictReader(path.read_text().splitlines())
+    return [{k: v for k, v in row.items() if not k.startswith("time/fps")} for row in rows]
 
 
 def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):

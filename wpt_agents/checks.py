@@ -34,6 +34,7 @@ CHOICES: dict[str, Collection[str]] = {
     "precision": ("fp32", "bf16"),
     "free_nats_mode": ("mean", "element"),
     "retrieval": ("nearest", "random"),
+    "train_freq": ("episode", "step"),
 }
 
 

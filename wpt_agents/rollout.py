@@ -93,13 +93,22 @@ class Rollout:
         return trajectory
 
 
-def step_all(env: VecEnv, action: np.ndarray) -> VecEnvStepReturn:
+def step_all(
+    env: VecEnv, action: np.ndarray, meanwhile: Callable[[], None] | None = None
+) -> VecEnvStepReturn:
     """One step of every environment.
 
+    :param meanwhile: what to do while worker processes step
     :raises RuntimeError: a worker process is gone; what was learnt and recorded is not
     """
     try:
-        return env.step(action)
+        env.step_async(action)
+        try:
+            if meanwhile is not None:
+                meanwhile()
+        finally:  # an answer left in the pipe would be taken for the next one
+            outcome = env.step_wait()
+        return outcome
     except (EOFError, ConnectionError) as error:  # all that SubprocVecEnv's pipes tell
         raise RuntimeError(
             "A worker process of the vector environment died; its own error stands above, if it "

@@ -88,6 +88,9 @@ class WPT(Pretraining, BaseAlgorithm):
     :param return_norm: divide returns by their 5-95 % range, if above 1; the size's own if None
     :param actor_outscale: factor on the initial weights of the actor's last layer
     :param train_ratio: replayed steps per collected step; one update replays B x T
+    :param train_freq: when the updates that a step has earned are made: "episode", at its end, as
+        in Algorithm 1, or "step", while the environments take the next one: side by side where they
+        have processes of their own (`SubprocVecEnv`), and learning the same where they have not
     :param learning_starts: steps collected before the first update
     :param warmup_steps: steps driven by the prior actor alone (uniform random without one)
     :param offline_ratio: share of retrieved sequences in a batch; 0: no rehearsal
@@ -137,6 +140,7 @@ class WPT(Pretraining, BaseAlgorithm):
         return_norm: bool | None = None,
         actor_outscale: float = 1.0,
         train_ratio: float = 256,
+        train_freq: str = "episode",
         learning_starts: int = 5_000,
         warmup_steps: int = 7_500,
         offline_ratio: float = 0.25,
@@ -375,7 +379,9 @@ class WPT(Pretraining, BaseAlgorithm):
         while go_on and not ended and self.num_timesteps < self._total_timesteps:
             image, _ = to_images(self._last_obs)
             action = rollout.act(image, self._guide())
-            new_obs, rewards, dones, infos = step_all(self.env, self.policy.to_env(action))
+            meanwhile = self._update_models if self.train_freq == "step" else None
+            to_env = self.policy.to_env(action)
+            new_obs, rewards, dones, infos = step_all(self.env, to_env, meanwhile)
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.learning_starts:

@@ -166,8 +166,7 @@ def _work(job: Run) -> dict[str, Any]:
             (job.folder / name).unlink(missing_ok=True)
     else:
         checkpoint.restore_logs(job.folder)
-    monitor = str(job.folder / "0.monitor.csv")
-    with closing(make_vec_env(job.task.id, job.shared.env, job.seed, monitor=monitor)) as venv:
+    with closing(_training_env(job)) as venv:
         model = make_model(job, venv, dataset, start, checkpoint)
         if dataset is not None and checkpoint is None:  # else it has retrieved already
             with clock("index"):
@@ -185,6 +184,13 @@ def _work(job: Run) -> dict[str, Any]:
     write_json(job.folder / "result.json", result)
     remove_checkpoints(job.folder)
     return result
+
+
+def _training_env(job: Run) -> VecEnv:
+    """The task to learn; in a process of its own where updates are made while it steps."""
+    monitor = str(job.folder / "0.monitor.csv")
+    overlap = job.preset.learn.overlap and job.wpt.get("train_freq") == "step"
+    return make_vec_env(job.task.id, job.shared.env, job.seed, monitor=monitor, workers=overlap)
 
 
 def make_model(

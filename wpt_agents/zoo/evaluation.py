@@ -13,7 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.zoo.behaviours import Act
@@ -116,21 +116,29 @@ class EpisodeSeeds(gym.Wrapper):
 
 
 def make_vec_env(
-    task: str, env: Mapping[str, Any], seed: int, n_envs: int = 1, monitor: str | None = None
+    task: str,
+    env: Mapping[str, Any],
+    seed: int,
+    n_envs: int = 1,
+    monitor: str | None = None,
+    workers: bool = False,
 ) -> VecEnv:
-    """Seeded copies of a task in one process, each under SB3's Monitor.
+    """Seeded copies of a task, each under SB3's Monitor.
 
     :param monitor: the file of its episodes, which is continued if it is there
+    :param workers: give each a process of its own
     """
     anew = monitor is None or not Path(monitor).exists()
     row = wpt_envs.TASKS.get(task)
     told = ("is_success",) if row is not None and row.metric == "success" else ()
 
     def make() -> gym.Env:
+        import wpt_envs  # noqa: F401  # a worker process knows the ids from it
+
         made = EpisodeSeeds(gym.make(task, **env))
         return Monitor(made, monitor, info_keywords=told, override_existing=anew)
 
-    venv = DummyVecEnv([make] * n_envs)
+    venv = SubprocVecEnv([make] * n_envs) if workers else DummyVecEnv([make] * n_envs)
     venv.seed(seed)
     return venv
 

@@ -78,10 +78,13 @@ class LearnSettings(Section):
     """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
 
     `checkpoint_every` so many frames a killed run can go on from there; 0: only from the end.
+    With `train_freq: step` the environment has a process of its own and steps beside the updates;
+    `overlap: false` keeps it in the learner's, which learns the same.
     """
 
     frames: int = 150_000
     checkpoint_every: int = 10_000
+    overlap: bool = True
 
 
 @dataclass(frozen=True)

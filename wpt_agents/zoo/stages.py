@@ -40,7 +40,14 @@ console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isat
 # Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
 FINE_TUNING = {
     *("actor_critic_learning_rate", "gamma", "lam", "ent_coef", "imagine_horizon", "return_norm"),
-    *("target_fraction", "train_ratio", "learning_starts", "warmup_steps", "guidance"),
+    *(
+        "target_fraction",
+        "train_ratio",
+        "train_freq",
+        "learning_starts",
+        "warmup_steps",
+        "guidance",
+    ),
     *("offline_ratio", "retrieval", "num_retrieve"),
     *("bc_steps", "bc_batch_size", "bc_learning_rate"),
 }

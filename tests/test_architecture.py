@@ -16,7 +16,7 @@ LAYERS = [
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "world_model", "checks", "acting"},
     {"policy"},
-    {"rollout", "updates", "saving", "distributed"},
+    {"rollout", "updates", "saving", "distributed", "compiled"},
     {"pretraining"},
     {"wpt"},
     {"exploration"},

@@ -2,11 +2,14 @@
 
 from collections import defaultdict
 
+import pytest
 import torch
 from debug_agent import agent, pretrained, recorded, weights
 from torch import nn
+from torch._dynamo.backends.registry import lookup_backend
 
 from wpt_agents import networks
+from wpt_agents.compiled import compile_loops
 from wpt_agents.rssm import RSSM, BlockGRU
 
 
@@ -23,8 +26,10 @@ def by_definition(patch):
     patch.setattr(BlockGRU, "forward", lambda self, h, z, a, shared=None: forward(self, h, z, a))
 
 
-def three_updates():
+def three_updates(backend=None):
     model = agent(batch_size=4, batch_length=6)
+    if backend is not None:
+        compile_loops(model.policy, backend)
     for seed in range(2):
         model.replay_buffer.add(recorded(seed=seed))
     metrics = defaultdict(list)
@@ -45,6 +50,25 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
         # Adam's first steps divide by the gradient itself, so that rounding moves a weight whose
         # gradient is nearly zero by up to the learning rate, 1e-3; hardly any is
         assert (weight - expected[name]).abs().mean() < 2e-5, name
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # at which torch looks
+def test_three_compiled_updates_are_those_of_the_definition(monkeypatch):
+    monkeypatch.setattr(RSSM, "_scan", RSSM._filter)  # the way of a GPU
+    expected, after = three_updates()
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(graph)
+        return lookup_backend("aot_eager")(graph, inputs)  # as traced, without a C++ compiler
+
+    compiled, weights_after = three_updates(backend)
+    # the scan's first step, whose state bears no gradient, its others, and the dream: once each
+    assert len(graphs) == 3
+    for name, values in expected.items():
+        torch.testing.assert_close(compiled[name], values, rtol=1e-4, atol=1e-5, msg=name)
+    for name, weight in after.items():
+        assert (weight - weights_after[name]).abs().mean() < 2e-5, name
 
 
 def test_bfloat16_leaves_the_curve_of_pretraining_as_it_is():

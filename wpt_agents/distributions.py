@@ -1,6 +1,7 @@
 """The three distributions: one-hot latents, two-hot returns, truncated-normal actions."""
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Generator, Tensor
@@ -24,8 +25,32 @@ class Share(Generator):
         self.rows, self.first = rows, first
 
 
-def exponential(like: Tensor, generator: Generator | None = None) -> Tensor:
+class Drawn:
+    """Random numbers drawn before, in the order of their use: what compiled code takes."""
+
+    def __init__(self, draws: Iterable[Tensor]) -> None:
+        self.left = list(draws)
+
+    def next(self) -> Tensor:
+        """Those that have not been used for longest."""
+        return self.left.pop(0)
+
+
+Noise = Generator | Drawn | None
+"""Where random numbers come from; None: torch's own generator."""
+
+
+def uniform(like: Tensor, generator: Noise = None) -> Tensor:
+    """Draws from [0, 1), in the shape of `like`."""
+    if isinstance(generator, Drawn):
+        return generator.next()
+    return torch.rand(like.shape, device=like.device, generator=generator)
+
+
+def exponential(like: Tensor, generator: Noise = None) -> Tensor:
     """Draws of Exp(1), in the shape of `like`: (N, ...)."""
+    if isinstance(generator, Drawn):
+        return generator.next()
     if not isinstance(generator, Share):
         return torch.empty_like(like).exponential_(generator=generator)
     whole = like.new_empty(generator.rows, *like.shape[1:]).exponential_(generator=generator)
@@ -83,7 +108,7 @@ def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:
     return torch.log((1 - unimix) * probs + unimix / logits.shape[-1])
 
 
-def sample_one_hot(logits: Tensor, generator: Generator | None = None) -> Tensor:
+def sample_one_hot(logits: Tensor, generator: Noise = None) -> Tensor:
     """A one-hot sample whose gradient is that of the probabilities (straight-through).
 
     :param logits: (..., K) log-probabilities
@@ -135,10 +160,9 @@ class TruncatedNormal:
         """(..., A): the mean of the uncut normal, which lies inside."""
         return self.mean * self.mask
 
-    def rsample(self, generator: Generator | None = None) -> Tensor:
+    def rsample(self, generator: Noise = None) -> Tensor:
         """(..., A): a sample by the inverse cumulative, differentiable in mean and std."""
-        uniform = torch.rand(self.mean.shape, device=self.mean.device, generator=generator)
-        cdf = self.low_cdf + uniform * self.mass
+        cdf = self.low_cdf + uniform(self.mean, generator) * self.mass
         z = SQRT2 * torch.erfinv((2 * cdf - 1).clamp(-1 + 1e-6, 1 - 1e-6))
         return (self.mean + self.std * z).clamp(-1, 1) * self.mask
 

@@ -14,6 +14,7 @@ from torch import Generator, Tensor
 from wpt_agents.acting import FastStep
 from wpt_agents.actor_critic import Actor, Critic
 from wpt_agents.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.distributions import Noise
 from wpt_agents.networks import Size, frozen
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
@@ -221,6 +222,11 @@ class WPTPolicy(BasePolicy):
 
         :param start: (N, ...), the states to start from
         """
+        with frozen(self.world_model):
+            return self.imagine(start.detach(), horizon, generator)
+
+    def imagine(self, start: Latent, horizon: int, generator: Noise = None) -> Dream:
+        """The loop of `dream`."""
         entropies, saturated = [], []
 
         def policy(state: Latent, _: int) -> Tensor:
@@ -229,10 +235,7 @@ class WPTPolicy(BasePolicy):
             saturated.append((dist.mean.detach().abs() > 0.99)[..., self.action_mask].float())
             return dist.rsample(generator)
 
-        with frozen(self.world_model):
-            states, action = self.world_model.rssm.imagine(
-                start.detach(), policy, horizon, generator
-            )
+        states, action = self.world_model.rssm.imagine(start, policy, horizon, generator)
         return Dream(states, action, torch.stack(entropies, 1), torch.stack(saturated).mean())
 
     @torch.no_grad()

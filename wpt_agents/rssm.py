@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
-from wpt_agents.distributions import mode_one_hot, sample_one_hot, unimix_logits
+from wpt_agents.distributions import Noise, mode_one_hot, sample_one_hot, unimix_logits
 from wpt_agents.networks import NORM_EPS, BlockLinear, LinearNorm, Size
 from wpt_agents.scan import FilterScan
 
@@ -182,14 +182,29 @@ class RSSM(nn.Module):
         keep = (~is_first).to(embed_half.dtype)
         deters, stochs, logits = [], [], []
         for t, mask in enumerate(keep.unbind(1)):
-            deter, stoch = deter * mask[:, None], stoch * mask[:, None, None]
-            deter = self.gru(deter, stoch, action_embed[:, t])
-            post_logits = self._posterior(deter, embed_half[:, t])
-            stoch = sample_one_hot(post_logits, generator) if sample else mode_one_hot(post_logits)
+            inputs = embed_half[:, t], action_embed[:, t], mask
+            deter, stoch, post_logits = self.loop_body(deter, stoch, *inputs, generator, sample)
             deters.append(deter)
             stochs.append(stoch)
             logits.append(post_logits)
         return Latent(torch.stack(deters, 1), torch.stack(stochs, 1)), torch.stack(logits, 1)
+
+    def loop_body(
+        self,
+        deter: Tensor,
+        stoch: Tensor,
+        embed_half: Tensor,
+        action_embed: Tensor,
+        keep: Tensor,
+        generator: Noise = None,
+        sample: bool = True,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step of `_filter`: the posterior state and its log-probabilities."""
+        deter, stoch = deter * keep[:, None], stoch * keep[:, None, None]
+        deter = self.gru(deter, stoch, action_embed)
+        post_logits = self._posterior(deter, embed_half)
+        stoch = sample_one_hot(post_logits, generator) if sample else mode_one_hot(post_logits)
+        return deter, stoch, post_logits
 
     def _scan(
         self,
@@ -246,7 +261,7 @@ class RSSM(nn.Module):
         state: Latent,
         policy: Callable[[Latent, int], Tensor],
         horizon: int,
-        generator: Generator | None = None,
+        generator: Noise = None,
         sample: bool = True,
     ) -> tuple[Latent, Tensor]:
         """Rolls p(z | h) out under a policy.

@@ -31,6 +31,7 @@ from tqdm.auto import tqdm
 
 from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_hyperparameters, check_rewards, check_spaces
+from wpt_agents.compiled import compile_loops
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, ever, parse_schedule
 from wpt_agents.importers.convert import Data
@@ -102,6 +103,8 @@ class WPT(Pretraining, BaseAlgorithm):
     :param bc_batch_size: pairs in each
     :param bc_learning_rate: of the prior actor
     :param precision: "fp32", or "bf16" for the forward passes; on a CPU it pays from `small` on
+    :param compile: whether `torch.compile` is to fuse the steps of scan and dream: for a GPU. The
+        first updates take minutes, and numbers differ in rounding
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 nothing, 1 information
     :param seed: of everything that is drawn
@@ -152,6 +155,7 @@ class WPT(Pretraining, BaseAlgorithm):
         bc_batch_size: int = 256,
         bc_learning_rate: float = 1e-4,
         precision: str = "fp32",
+        compile: bool = False,
         tensorboard_log: str | None = None,
         verbose: int = 0,
         seed: int | None = None,
@@ -209,6 +213,8 @@ class WPT(Pretraining, BaseAlgorithm):
             self.actor_outscale,
         ).to(self.device)
         self.policy.generator = Generator(self.device).manual_seed(self.stream_seed)
+        if self.compile:
+            compile_loops(self.policy)
         self._setup_optimizers()
 
     def set_random_seed(self, seed: int | None = None) -> None:

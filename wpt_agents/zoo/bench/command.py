@@ -33,6 +33,9 @@ def bench(
     ),
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
+    compiled: Annotated[
+        bool, typer.Option("--compile", help="Of model: scan and dream by torch.compile; minutes.")
+    ] = False,
     peer: Annotated[
         Peer | None, typer.Option(help="Of model: this library's DreamerV3 beside ours instead.")
     ] = None,
@@ -55,8 +58,11 @@ def bench(
         raise ValueError(f"--peer goes with bench model, not with bench {case}")
     if plot and case != Case.scaling:
         raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
+    if compiled and (peer or case != Case.model):
+        raise ValueError("--compile goes with bench model, and not with --peer")
     options: dict[str, Any] = {
         "quick": quick,
+        "compiled": compiled,
         "threads": threads,
         "precision": str(precision),
         "peer": peer,

@@ -26,26 +26,31 @@ CASES = (  # size, batch, length; `bench scaling` shows what grows with each
 )
 
 
-def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
+def rows(
+    quick: bool = False, threads: int = 1, precision: str = "fp32", compiled: bool = False
+) -> Iterator[dict]:
     """One row a case; `quick` takes the debug size and one repetition."""
     torch.set_num_threads(threads)
     for case in (("debug", 2, 8),) if quick else CASES:
-        yield from updates(*case, precision, 1 if quick else 3)
+        yield from updates(*case, precision, 1 if quick else 3, compiled)
 
 
 def updates(
-    size: str, batch: int, length: int, precision: str, repetitions: int
+    size: str, batch: int, length: int, precision: str, repetitions: int, compiled: bool = False
 ) -> Iterator[dict[str, Any]]:
     """A row for the world model's step, and one for the whole update."""
-    model = agent(size, precision)
+    model = agent(size, precision, compiled)
+    plain = agent(size, precision) if compiled else model
     data = synthetic_batch(batch, length).to(model.device)
     about = {"size": size, "batch": batch, "length": length, "dtype": precision}
+    about |= {"compiled": True} if compiled else {}
     networks = model.policy.world_model, model.policy.actor, model.policy.critic
-    for what, step, params in (
-        ("world model", world_model_step(model, data), count(networks[0])),
-        ("whole update", whole_step(model, data), count(*networks)),
+    for what, make, params in (
+        ("world model", world_model_step, count(networks[0])),
+        ("whole update", whole_step, count(*networks)),
     ):
-        yield from measured_in_turn([(step, about | {"what": what, "params": params})], repetitions)
+        case = make(model, data), about | {"what": what, "params": params}
+        yield from measured_in_turn([case], repetitions, counted=[make(plain, data)])
 
 
 def count(*networks: nn.Module) -> int:
@@ -54,15 +59,20 @@ def count(*networks: nn.Module) -> int:
 
 
 def measured_in_turn(
-    cases: Sequence[tuple[Callable[[], Any], dict[str, Any]]], repetitions: int
+    cases: Sequence[tuple[Callable[[], Any], dict[str, Any]]],
+    repetitions: int,
+    counted: Sequence[Callable[[], Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """A row for each of several steps, which take turns: time, work, memory, and the ceiling."""
+    """A row for each of several steps, which take turns: time, work, memory, and the ceiling.
+
+    :param counted: the like of the steps for counting their work, which compiled code hides
+    """
     steps = [step for step, _ in cases]
+    work = [gflop(step) for step in counted or steps]
     held = [_peak_mb(step) for step in steps]
-    work = [gflop(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
     before = ceiling(device=device)
-    times = seconds_in_turn(steps, repetitions, warmup=0)  # they have run twice
+    times = seconds_in_turn(steps, repetitions, warmup=1)
     limit = (before + ceiling(device=device)) / 2
     rows = []
     for (_, about), (processor, wall), flops, peak in zip(cases, times, work, held, strict=True):
@@ -89,9 +99,9 @@ def _peak_mb(step: Callable[[], Any]) -> float:
     return peak_rss_mb()
 
 
-def agent(size: str, precision: str = "fp32") -> WPT:
+def agent(size: str, precision: str = "fp32", compiled: bool = False) -> WPT:
     """An agent of six actions that has seen nothing."""
-    return WPT(size=size, max_action_dim=ACTIONS, precision=precision, seed=0)
+    return WPT(size=size, max_action_dim=ACTIONS, precision=precision, compile=compiled, seed=0)
 
 
 def synthetic_batch(batch: int, length: int) -> Batch:

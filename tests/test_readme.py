@@ -143,14 +143,6 @@ def test_every_logged_value_is_explained_and_no_other(monkeypatch):
     assert explained == seen | {"rollout/success_rate"}  # which a dot does not report
 
 
-def test_rewards_on_an_episode_never_trained_on_are_compared(capsys):
-    page = PAGES["when-it-does-not-learn.md"]
-    exec(blocks(page)[0], {"env": toy_env.DotEnv(), "model": agent(toy_env.DotEnv())})
-    assert re.fullmatch(
-        r"error \d\.\d+ a step, where a step pays \d\.\d+\n", capsys.readouterr().out
-    )
-
-
 def test_a_dataset_is_made_and_used_as_its_page_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(blocks(PAGES["data.md"])[0], left := {})

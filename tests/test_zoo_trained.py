@@ -5,15 +5,20 @@ import re
 import shutil
 import sys
 
+import numpy as np
 import pytest
+import torch
 import yaml
+from debug_agent import agent, noise
 from hub_stand_in import hub  # noqa: F401  (a fixture)
 from imageio_ffmpeg import count_frames_and_secs
 from run_folders import make_run
 from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
+from wpt_agents.trajectory import Trajectory
 from wpt_agents.zoo.benchmark import run
+from wpt_agents.zoo.diagnosis import promises
 from wpt_agents.zoo.hub import card, pull, push
 from wpt_agents.zoo.trained import find_trained
 
@@ -49,6 +54,43 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
     monkeypatch.setattr("wpt_agents.zoo.trained._config", lambda _: {"env": SECTIONS["env"]})
     assert call(monkeypatch, "eval", model, *words) == 0
+
+
+def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
+    folder, _, seed = moved
+    words = ["--episodes", "2", "--horizon", "10", "--seed", seed]
+    assert call(monkeypatch, "diagnose", folder, *words) == 0
+    told = capsys.readouterr().out
+    assert all(word in told for word in ("earned", "dream of the actor", "discounted return"))
+    rows = re.findall(r"│ +(\d+) │ +(-?[\d.]+) │", told)
+    assert [int(step) for step, _ in rows] == [0, 3, 7, 11, 15]  # five from 0 to 25 - 10
+    returns = find_trained(folder).evaluate(find_trained(folder).load(), 1, seed).returns
+    assert re.search(rf"Returns: {returns[0]:.0f}, ", told)
+    assert call(monkeypatch, "diagnose", folder, "--horizon", "26") == 2
+    assert "shorter --horizon" in capsys.readouterr().err
+
+
+def test_promises_are_of_the_actions_and_rewards_from_the_start_on(monkeypatch):
+    policy, rng = agent(max_action_dim=3).policy, np.random.default_rng(0)
+    action, reward = rng.uniform(-1, 1, (6, 3)).astype(np.float32), np.arange(6, dtype=np.float32)
+    rssm, taken = policy.world_model.rssm, []
+
+    def noted(state, act, horizon, generator):
+        taken.append(torch.stack([act(state, t) for t in range(horizon)], 1))
+        return imagine(state, act, horizon, generator)
+
+    imagine = rssm.imagine
+    monkeypatch.setattr(rssm, "imagine", noted)
+    played = Trajectory(noise(7), action, reward)
+    found = promises(policy, played, 0.5, [0, 4], 2)
+    assert [(p.start, p.earned) for p in found] == [(0, 0.5), (4, 4.5)]
+    assert [p.discounted for p in found] == [
+        sum(r * 0.5**t for t, r in enumerate(reward)),
+        4 + 0.5 * 5,
+    ]
+    np.testing.assert_array_equal(taken[0][0], action[:2])
+    np.testing.assert_array_equal(taken[2][0], action[4:])  # taken[1] are the actor's own
+    assert not np.array_equal(taken[1][0], action[:2])
 
 
 def test_a_moved_out_is_not_done_again(tmp_path):

@@ -245,6 +245,25 @@ def enjoy_model(
     typer.echo(f"Return {number(total)}. Video: {out.resolve()}")
 
 
+@app.command("diagnose")
+def diagnose_model(
+    run: RunFolder,
+    task: ForTask = "",
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 5,
+    horizon: Annotated[int, typer.Option(min=1, help="Steps to dream.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    device: Device = "auto",
+) -> None:
+    """Shows why a policy earns what it earns: what its world model promises, and what comes.
+
+    Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
+    """
+    from wpt_agents.zoo.diagnosis import diagnose, show
+    from wpt_agents.zoo.trained import find_trained
+
+    show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
+
+
 @app.command("push")
 def push_run(
     run: Annotated[Path, typer.Argument(help="A finished run's folder.")],

@@ -88,6 +88,14 @@ def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeyp
     assert not (broken.folder / "replay").exists()
 
 
+def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch, capsys):
+    changes = {"env": {"action_repeat": 2}, "learn": {"frames": 150, "checkpoint_every": 50}}
+    one = job(tmp_path, "scratch", **changes)
+    killed_at(60, monkeypatch, one)
+    run(one)
+    assert "continued at 100 of 150 frames, 75 steps" in capsys.readouterr().out
+
+
 def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):
     one = job(tmp_path, **CHANGES)
     with monkeypatch.context() as patch:

@@ -223,7 +223,8 @@ class _Watched(WPT):
 def _learn(job: Run, model: WPT, checkpoint: Checkpoint | None) -> float:
     """Stage 4: fine-tuning, evaluated in between where the preset says so; its seconds."""
     frames, steps, given = job.preset.learn.frames, job.preset.steps, job.preset.learn
-    state = f"continued at {model.num_timesteps:,} of " if checkpoint else ""
+    done = model.num_timesteps * job.preset.env.action_repeat
+    state = f"continued at {done:,} of " if checkpoint else ""
     text = f"{state}{frames:,} frames, {steps:,} steps of {short_name(job.task)}"
     say("learn", f"{text}, method {job.method}, seed {job.seed}")
     outputs = [ContinuedCSV(job.folder / "progress.csv"), TensorBoardOutputFormat(str(job.folder))]

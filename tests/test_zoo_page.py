@@ -11,6 +11,7 @@ from run_folders import make_run
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.page import write_page
+from wpt_agents.zoo.report.sections import shared_about
 
 
 @pytest.fixture
@@ -93,6 +94,18 @@ def test_budgets_seeds_and_commits_stand_in_the_cells_where_they_differ(tmp_path
     told = text((tmp_path / "index.html").read_text())
     assert "1,000 frames, seeds 0, commit 0123456789ab" in told
     assert "1,000 frames, seeds 0, 1, commit 0123456789ab" in told
+
+
+def test_budgets_seeds_and_commits_stand_at_the_columns_head_where_they_agree():
+    def row(*abouts):
+        return {"ours": [{"run": "a", "about": about} for about in abouts]}
+
+    alike = [row("1k frames", "1k frames"), row("1k frames", "2k frames")]
+    assert [shared_about(alike, place) for place in range(2)] == ["1k frames", ""]
+    assert [[cell["about"] for cell in r["ours"]] for r in alike] == [
+        ["", "1k frames"],
+        ["", "2k frames"],
+    ]
 
 
 def test_tasks_that_were_not_run_are_folded_away(page):

@@ -9,7 +9,6 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.guidance import parse_schedule
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
 from wpt_agents.trajectory import IMAGE_SIZE
@@ -42,13 +41,11 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
     """Refuses values of WPT's keywords that make no sense, each by name.
 
     :raises ValueError: a count that is no whole number from 1 on, a share outside [0, 1], something
-        else that is no number from 0 on, an unknown choice or schedule
+        else that is no number from 0 on, an unknown choice
     """
     for name, value in given.items():
         if name in CHOICES and value not in CHOICES[name]:
             raise unknown_name(name, value, CHOICES[name])
-        if name == "guidance":
-            parse_schedule(value)
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if name in COUNTS and not (number and value >= 1 and value == int(value)):
             raise ValueError(f"{name} is a whole number from 1 on, got {value!r}")

@@ -32,7 +32,7 @@ class Drawn:
         self.left = list(draws)
 
     def next(self) -> Tensor:
-        """Those that have not been used for longest."""
+        """The next in order."""
         return self.left.pop(0)
 
 

@@ -232,11 +232,12 @@ class WPTPolicy(BasePolicy):
         def policy(state: Latent, _: int) -> Tensor:
             dist = self.actor.dist(state.feat.detach(), self.action_mask)
             entropies.append(dist.entropy())
-            saturated.append((dist.mean.detach().abs() > 0.99)[..., self.action_mask].float())
+            saturated.append(((dist.mean.detach().abs() > 0.99) & self.action_mask).float().sum(-1))
             return dist.rsample(generator)
 
         states, action = self.world_model.rssm.imagine(start, policy, horizon, generator)
-        return Dream(states, action, torch.stack(entropies, 1), torch.stack(saturated).mean())
+        share = torch.stack(saturated).mean() / self.action_mask.sum()
+        return Dream(states, action, torch.stack(entropies, 1), share)
 
     @torch.no_grad()
     def embed(self, image: np.ndarray) -> np.ndarray:

@@ -176,6 +176,14 @@ def test_nothing_in_the_padding_of_the_actor_changes_its_actions(policy, start):
     torch.testing.assert_close(*results, rtol=0, atol=0)
 
 
+def test_the_share_of_saturated_means_is_of_the_robots_own_actions(policy, start):
+    with torch.no_grad():
+        last = policy.actor.layers[-1]
+        last.weight.zero_()
+        last.bias[:WIDTH] = torch.tensor([100.0, 0, 100, 100, 100])  # two entries are its own
+    assert policy.dream(start, H, torch.Generator().manual_seed(0)).saturated == 0.5
+
+
 def test_the_padding_of_the_actor_is_not_trained(policy, start):
     judged(policy, start, ent_coef=0.1).backward()
     bias = policy.actor.layers[-1].bias.grad

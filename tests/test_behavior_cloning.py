@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from wpt_agents.behavior_cloning import FRAMES, PriorActor, bc_loss, draw_pairs, random_shift
+from wpt_agents.behavior_cloning import (
+    FRAMES,
+    PriorActor,
+    bc_loss,
+    draw_pairs,
+    random_shift,
+    recent_frames,
+)
 from wpt_agents.networks import SIZES
 from wpt_agents.trajectory import Trajectory
 
@@ -114,3 +121,15 @@ def test_a_pair_is_what_was_seen_up_to_a_step_and_the_action_taken_at_it():
     assert (action[:, 2] == 0).all()
     share = sum(frames[-1] == 20 for frames in shown) / 400  # one step of five
     assert share == pytest.approx(0.2, abs=0.06)
+
+
+def test_what_is_imitated_sees_the_last_three_images_of_its_own_episode():
+    # two windows: one out of an episode's middle; one where another begins at the fourth image
+    image = torch.tensor([[10, 11, 12, 13, 14], [5, 6, 7, 0, 1]], dtype=torch.uint8)
+    is_first = torch.tensor([[0, 0, 0, 0, 0], [0, 0, 0, 1, 0]]).bool()
+    seen = recent_frames(image[..., None, None, None].expand(2, 5, 64, 64, 3), is_first)
+    assert seen.shape == (2, 3, FRAMES, 64, 64, 3)
+    assert seen[..., 0, 0, 0].tolist() == [
+        [[10, 11, 12], [11, 12, 13], [12, 13, 14]],
+        [[5, 6, 7], [0, 0, 0], [0, 0, 1]],
+    ]

@@ -50,6 +50,14 @@ def test_another_schedule_is_refused_with_an_example(text):
         parse_schedule(text)
 
 
+def test_a_weight_may_be_larger_than_a_probability():
+    assert parse_schedule("linear(20,4,100)", most=np.inf)(50) == pytest.approx(12)
+    with pytest.raises(ValueError, match="from 0 to 1,"):
+        parse_schedule("linear(20,4,100)")
+    with pytest.raises(ValueError, match="from 0 to inf,"):
+        parse_schedule(-1, most=np.inf)
+
+
 @pytest.mark.parametrize("length", [1, 2, 7, 25, 100, 500])
 def test_windows_lie_inside_the_episode_and_are_never_empty(length):
     generator = rng()

@@ -24,6 +24,8 @@ from toy_env import LENGTH, DotEnv
 
 from wpt_agents import pretraining, wpt
 from wpt_agents.dataset import TrajectoryDataset
+from wpt_agents.guidance import parse_schedule
+from wpt_agents.policy import prior_action, stack_frames
 from wpt_agents.retrieval import Retriever
 from wpt_agents.rollout import Rollout
 from wpt_agents.trajectory import Trajectory
@@ -504,6 +506,58 @@ def test_another_task_starts_from_returns_of_no_known_scale():
 def test_guidance_that_begins_later_has_a_clone_too(store):
     model = pretrained(store, env=DotEnv(), guidance="linear(0,1,40)").learn(2 * LENGTH)
     assert model.cloned
+
+
+def replayed(model):
+    """A batch of the model's replay and the latents of its images."""
+    batch = model.replay_buffer.sample(2, 5, 4, np.random.default_rng(0))
+    with torch.no_grad():
+        post, *_ = model.policy.world_model.observe(batch, torch.Generator().manual_seed(0))
+    return post, batch
+
+
+def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule(store):
+    model = pretrained(store, env=DotEnv(), kickstart="linear(20,0,100)").learn(2 * LENGTH)
+    post, batch = replayed(model)
+    policy, by_hand = model.policy, []
+    for b in range(2):
+        frames = None
+        for t in range(5):
+            frames = stack_frames(batch.image[b, t : t + 1].numpy(), frames, None)
+            own = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
+            error = (own - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
+            by_hand += [error.mean().item()] * (t >= 2)
+    loss = model._imitation(post, batch, defaultdict(list))
+    assert model.num_timesteps == 50  # half way from 20 to 0
+    assert loss.item() == pytest.approx(10 * np.mean(by_hand), rel=1e-4)
+
+
+def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
+    model = pretrained(store, env=DotEnv(), kickstart=5).learn(2 * LENGTH)
+    model.policy.zero_grad()
+    model._imitation(*replayed(model), defaultdict(list)).backward()
+    taught = {k.split(".")[0] for k, p in model.policy.named_parameters() if p.grad is not None}
+    assert taught == {"actor"}
+    assert pretrained(store, env=DotEnv()).learn(LENGTH)._imitation(None, None, {}) == 0
+
+
+def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
+    distances = []
+    for kickstart in (0.0, 100.0):
+        model = pretrained(
+            *(store, 2),
+            **{"env": DotEnv(), "kickstart": kickstart, "guidance": 1, "train_ratio": 8},
+            **{"actor_critic_learning_rate": 3e-3, "bc_steps": 30, "return_norm": True},
+        ).learn(4 * LENGTH)
+        model.kickstart_schedule = parse_schedule(1)
+        distances.append(model._imitation(*replayed(model), defaultdict(list)).item())
+    assert distances[1] < 0.2 * distances[0]
+
+
+def test_kickstarting_alone_has_a_clone_and_wants_windows_of_three_images(store):
+    assert pretrained(store, env=DotEnv(), guidance=0, kickstart=1).learn(LENGTH).cloned
+    with pytest.raises(ValueError, match=r"kickstart .*3 images.*batch_length=2"):
+        agent(DotEnv(), kickstart=1, batch_length=2)
 
 
 def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):

@@ -59,6 +59,22 @@ def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None
     return moved[which, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2, 4)
 
 
+def recent_frames(image: Tensor, is_first: Tensor) -> Tensor:
+    """What the prior actor sees at each image of a window, from its third one on.
+
+    Where an episode begins inside the window, its first image stands for those that are missing.
+
+    :param image: (B, T, 64, 64, 3)
+    :param is_first: (B, T) bool
+    :return: (B, T - 2, F, 64, 64, 3), oldest first
+    """
+    time = torch.arange(image.shape[1], device=image.device)
+    begun = torch.where(is_first, time, 0).cummax(1).values
+    before = torch.arange(1 - FRAMES, 1, device=image.device)
+    wanted = torch.maximum(time[:, None] + before, begun[..., None])[:, FRAMES - 1 :]
+    return image[torch.arange(len(image), device=image.device)[:, None, None], wanted]
+
+
 class PriorActor(nn.Module):
     """π_bc(a | o): its own encoder over three stacked frames, then an MLP.
 

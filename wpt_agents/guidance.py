@@ -1,4 +1,7 @@
-"""Execution guidance: how often, and for which steps of an episode, the prior actor drives."""
+"""Execution guidance: how often, and for which steps of an episode, the prior actor drives.
+
+Also the schedules, by which guidance and kickstarting fade out.
+"""
 
 import re
 import sys
@@ -19,9 +22,10 @@ def linear(start: float, end: float, duration: float) -> Schedule:
     return lambda step: start + (end - start) * min(max(step / duration, 0.0), 1.0)
 
 
-def parse_schedule(text: str | float) -> Schedule:
+def parse_schedule(text: str | float, most: float = 1.0) -> Schedule:
     """'linear(1,0,50000)' or a constant -> the schedule.
 
+    :param most: the largest value allowed: 1 for a probability, infinite for a weight
     :raises ValueError: anything else
     """
     number = r"([-+0-9.eE_]+)"
@@ -29,17 +33,17 @@ def parse_schedule(text: str | float) -> Schedule:
     try:
         if match:
             start, end, duration = (float(group) for group in match.groups())
-            if duration > 0 and all(0 <= p <= 1 for p in (start, end)):
+            if duration > 0 and all(0 <= value <= most for value in (start, end)):
                 return linear(start, end, duration)
         else:
             constant = float(text)
-            if 0 <= constant <= 1:
+            if 0 <= constant <= most:
                 return lambda step: constant
     except (ValueError, TypeError):
         pass
     raise ValueError(
-        f"Schedule {text!r} is not understood: write a probability, or 'linear(start,end,steps)' "
-        "of two probabilities and steps > 0, for example 'linear(1,0,50000)'"
+        f"Schedule {text!r} is not understood: write a number from 0 to {most:g}, or "
+        "'linear(start,end,steps)' of two of them and steps > 0, for example 'linear(1,0,50000)'"
     )
 
 

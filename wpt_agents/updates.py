@@ -20,6 +20,8 @@ from wpt_agents.actor_critic import (
     lambda_return,
     return_range,
 )
+from wpt_agents.behavior_cloning import FRAMES, bc_loss, recent_frames
+from wpt_agents.guidance import Schedule
 from wpt_agents.networks import SIZES, frozen
 from wpt_agents.policy import Dream, WPTPolicy
 from wpt_agents.replay import ReplayBuffer, mix
@@ -40,6 +42,9 @@ class Updates:
     learning_rate: float
     stream_seed: int
     updates: int
+    num_timesteps: int
+    cloned: bool
+    kickstart_schedule: Schedule
     size: str
     actor_critic_learning_rate: float | None
     max_action_dim: int
@@ -88,7 +93,8 @@ class Updates:
             self._stream(UPDATE, self.updates),
         ).to(self.device)
         post = self._update_world_model(batch, metrics, generator, learn_reward=True)
-        self._update_behavior(post.flatten_time(), metrics, generator)
+        imitation = self._imitation(post, batch, metrics)
+        self._update_behavior(post.flatten_time(), metrics, generator, imitation)
         self.updates += 1
 
     def _update_world_model(
@@ -117,10 +123,37 @@ class Updates:
         names = "dyn_scale", "rep_scale", "free_nats", "free_nats_mode"
         return {name: getattr(self, name) for name in names}
 
+    def _imitation(
+        self, post: Latent, batch: Batch, metrics: dict[str, list[Tensor]]
+    ) -> Tensor | float:
+        """Kickstarting: what the actor pays for doing otherwise than the prior actor would.
+
+        The paper does not have it. Source: https://arxiv.org/abs/1803.03835
+        """
+        weight = self.kickstart_schedule(self.num_timesteps) if self.cloned else 0.0
+        if weight == 0:
+            return 0.0
+        policy, mask = self.policy, self.policy.action_mask
+        seen = recent_frames(batch.image, batch.is_first).flatten(0, 1)
+        feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
+        with self._autocast():
+            with torch.no_grad():
+                advice = policy.prior_actor.act(seen, mask)
+            loss = bc_loss(policy.actor.dist(feat, mask).mode, advice, mask)
+        metrics["train/kickstart_loss"].append(loss.detach())
+        return weight * loss
+
     def _update_behavior(
-        self, start: Latent, metrics: dict[str, list[Tensor]], generator: Generator
+        self,
+        start: Latent,
+        metrics: dict[str, list[Tensor]],
+        generator: Generator,
+        imitation: Tensor | float = 0.0,
     ) -> None:
-        """Actor and critic on imagined trajectories, Eq. (2) to (4)."""
+        """Actor and critic on imagined trajectories, Eq. (2) to (4).
+
+        :param imitation: added to the actor's loss
+        """
         policy = self.policy
         with self._autocast():
             dream = policy.dream(start, self.imagine_horizon, generator)
@@ -133,6 +166,7 @@ class Updates:
                 spread = policy.return_scale.lerp(return_range(returns), 0.01)
                 scale = spread.clamp_min(1.0)
             loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
+            loss = loss + imitation
         actor_norm = self._descend(self.actor_optimizer, loss, "actor")
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():

@@ -29,7 +29,7 @@ from torch import Generator, Tensor
 from torch.optim import AdamW
 from tqdm.auto import tqdm
 
-from wpt_agents.behavior_cloning import bc_loss, draw_pairs, random_shift
+from wpt_agents.behavior_cloning import FRAMES, bc_loss, draw_pairs, random_shift
 from wpt_agents.checks import check_dataset, check_hyperparameters, check_rewards, check_spaces
 from wpt_agents.compiled import compile_loops
 from wpt_agents.dataset import TrajectoryDataset
@@ -96,6 +96,8 @@ class WPT(Pretraining, BaseAlgorithm):
     :param warmup_steps: steps driven by the prior actor alone (uniform random without one)
     :param offline_ratio: share of retrieved sequences in a batch; 0: no rehearsal
     :param guidance: schedule of the probability that an episode is guided; 0: none
+    :param kickstart: schedule of the weight at which the actor imitates the prior actor where
+        images are replayed: what the paper does not do, and 20 where the clone is good. 0: none
     :param episode_length: steps of an episode, for the guidance window; found out if None
     :param num_retrieve: R, trajectories to retrieve
     :param retrieval: "nearest", by Eq. (5), or "random", its ablation
@@ -148,6 +150,7 @@ class WPT(Pretraining, BaseAlgorithm):
         warmup_steps: int = 7_500,
         offline_ratio: float = 0.25,
         guidance: str | float = "linear(1,0,50000)",
+        kickstart: str | float = 0.0,
         episode_length: int | None = None,
         num_retrieve: int = 500,
         retrieval: str = "nearest",
@@ -181,6 +184,12 @@ class WPT(Pretraining, BaseAlgorithm):
         self.observation_space, self.n_envs = IMAGE_SPACE, 1
         self.action_space = spaces.Box(-1.0, 1.0, (max_action_dim,), np.float32)
         self.schedule = parse_schedule(guidance)
+        self.kickstart_schedule = parse_schedule(kickstart, most=np.inf)
+        if ever(self.kickstart_schedule) and batch_length < FRAMES:
+            raise ValueError(
+                f"kickstart looks at {FRAMES} images in a row, but batch_length={batch_length}: "
+                f"give batch_length={FRAMES} or more, or kickstart=0"
+            )
         self.dataset: TrajectoryDataset | None = None
         self.replay_buffer = ReplayBuffer()
         self.retrieved: ReplayBuffer | None = None
@@ -434,8 +443,8 @@ class WPT(Pretraining, BaseAlgorithm):
         return getattr(spec, "max_episode_steps", None) or 500
 
     def _guided(self) -> bool:
-        """Whether the prior actor will ever drive."""
-        return ever(self.schedule)
+        """Whether the prior actor will ever drive, or be imitated."""
+        return ever(self.schedule) or ever(self.kickstart_schedule)
 
     def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
         if self.cloned:

@@ -113,7 +113,7 @@ def run_benchmark(
     method: Annotated[
         list[str],
         typer.Option(
-            help="wpt, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain, "
+            help="wpt, kickstart, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain, "
             "random-retrieval; several allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
         ),
     ] = ["wpt"],  # noqa: B006

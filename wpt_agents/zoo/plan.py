@@ -35,11 +35,13 @@ class Method:
     wpt: Mapping[str, Any] = field(default_factory=dict)
 
 
+ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
 METHODS = {
     "wpt": Method(),
-    "scratch": Method(False, False, {"offline_ratio": 0.0, "guidance": 0.0}),
-    "pretrain-only": Method(wpt={"offline_ratio": 0.0, "guidance": 0.0}),
-    "no-guidance": Method(wpt={"guidance": 0.0}),
+    "kickstart": Method(wpt={"kickstart": 20.0}),
+    "scratch": Method(False, False, ALONE),
+    "pretrain-only": Method(wpt=ALONE),
+    "no-guidance": Method(wpt={"guidance": 0.0, "kickstart": 0.0}),
     "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
     "random-retrieval": Method(wpt={"retrieval": "random"}),
@@ -109,8 +111,10 @@ class Run:
     def retrieves(self) -> bool:
         """Whether trajectories are retrieved, for rehearsal or for guidance."""
         wpt = wpt_keywords() | self.wpt
-        guided = ever(parse_schedule(wpt["guidance"]))
-        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or guided)
+        clones = ever(parse_schedule(wpt["guidance"])) or ever(
+            parse_schedule(wpt["kickstart"], np.inf)
+        )
+        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or clones)
 
     @property
     def updates(self) -> int:

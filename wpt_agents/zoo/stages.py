@@ -47,6 +47,7 @@ FINE_TUNING = {
         "learning_starts",
         "warmup_steps",
         "guidance",
+        "kickstart",
     ),
     *("offline_ratio", "retrieval", "num_retrieve"),
     *("bc_steps", "bc_batch_size", "bc_learning_rate"),

@@ -48,8 +48,10 @@ def test_data_of_ones_own_are_in_the_command():
 
 def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
     names = [("WPT", "scratch"), ("WPT, last", "wpt"), ("prior actor", "no-pretrain")]
+    names += [("prior actor", "kickstart"), ("WPT", "kickstart")]
     told = [record._method(*each) for each in names]
-    assert told == ["scratch", "wpt, last", "prior actor, no-pretrain"]
+    assert told[:3] == ["scratch", "wpt, last", "prior actor, no-pretrain"]
+    assert told[3:] == ["prior actor", "kickstart"]  # the same clone as wpt's
 
 
 def test_a_record_grows_and_replaces_the_same_run(tmp_path):

@@ -57,6 +57,7 @@ class Line:
         return self.task, self.method, self.preset, self.frames, self.seed
 
 
+WPT_CLONES = "wpt", "kickstart", "no-rehearsal"  # methods whose prior actor is wpt's
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
 
 
@@ -90,7 +91,7 @@ def _method(policy: str, method: str) -> str:
     if policy in UNTRAINED:
         return policy
     name = policy.replace("WPT", method)
-    return name if policy.startswith("WPT") or method == "wpt" else f"{name}, {method}"
+    return name if policy.startswith("WPT") or method in WPT_CLONES else f"{name}, {method}"
 
 
 def command(result: Mapping[str, Any]) -> str:

@@ -79,6 +79,15 @@ def test_a_dotted_name_never_loads_another_file(tmp_path):
         WPT.load(tmp_path / "model.v2")
 
 
+def test_a_run_folder_is_loaded_by_its_model(tmp_path):
+    (tmp_path / "walker_0").mkdir()
+    agent(ClockEnv(), gamma=0.9).save(tmp_path / "walker_0" / "model.zip")
+    assert WPT.load(tmp_path / "walker_0").gamma == 0.9
+    agent(ClockEnv(), gamma=0.8).save(tmp_path / "cheetah")
+    (tmp_path / "cheetah").mkdir()  # a folder of other things beside cheetah.zip
+    assert WPT.load(tmp_path / "cheetah").gamma == 0.8
+
+
 def test_the_file_is_json_and_safetensors_and_holds_no_data(learnt, tmp_path):
     learnt.save(tmp_path / "model.zip")
     names = zipfile.ZipFile(tmp_path / "model.zip").namelist()

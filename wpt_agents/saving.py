@@ -87,14 +87,16 @@ class Saving:
     ) -> Self:
         """Reads a model file onto any environment of at most `max_action_dim` actions.
 
-        :param path: as given to `save`
+        :param path: as given to `save`, or a folder that holds a `model.zip`, as the zoo's do
         :param env: the environment to go on with
         :param custom_objects: accepted for SB3's sake
         :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
         :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
         """
-        if isinstance(path, str | os.PathLike) and not Path(path).suffix:
-            path = Path(path).with_suffix(".zip")
+        if isinstance(path, str | os.PathLike):
+            path = Path(path)
+            inside = path / "model.zip"
+            path = inside if inside.exists() else path.with_suffix(path.suffix or ".zip")
         cls._check_keywords(kwargs)
         about, tensors = read_model(path)
         model = cls(device=device, **{**about["hyperparameters"], **kwargs})

@@ -1,4 +1,4 @@
-"""What `bench prediction` measures, by hand, and the command from data to pictures."""
+"""What `open-loop` and `bench prediction` measure, by hand, and both commands to their pictures."""
 
 import json
 from dataclasses import replace
@@ -15,8 +15,10 @@ from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.networks import to_unit
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.world_model import world_model_loss
+from wpt_agents.wpt import WPT
+from wpt_agents.zoo import prediction, prediction_pictures
 from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.bench import prediction, prediction_pictures
+from wpt_agents.zoo.bench import prediction as bench
 
 PIXELS = 64 * 64 * 3
 
@@ -62,11 +64,11 @@ def test_the_last_episodes_of_each_task_are_held_out(tmp_path):
     with TrajectoryDataset.create(tmp_path / "data") as data:
         for speed in range(1, 7):  # three episodes of each of two tasks
             data.append(clock(2, speed))
-    plan = prediction.QUICK._replace(episodes=3, held_out=1)
-    trained_on, held_out = prediction.split(data, plan)
+    plan = bench.QUICK._replace(episodes=3, held_out=1)
+    trained_on, held_out = bench.split(data, plan)
     assert held_out.embodiments == ["clock 3", "clock 6"]
     assert trained_on.embodiments == ["clock 1", "clock 2", "clock 4", "clock 5"]
-    assert prediction.of(trained_on, "clock 2", "clock 5").embodiments == ["clock 2", "clock 5"]
+    assert bench.of(trained_on, "clock 2", "clock 5").embodiments == ["clock 2", "clock 5"]
 
 
 def test_windows_reach_from_start_to_end_each_image_with_the_action_that_led_to_it():
@@ -132,7 +134,7 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
     told = {robot: [r["prediction"] for r in rows if r["robot"] == robot] for robot in ROBOTS}
     assert told == {"walker": five + more, "cartpole": five}
     assert all(row["+1"] >= 0 and row["trajectories"] == 2 for row in rows)
-    folder = tmp_path / prediction.QUICK.folder
+    folder = tmp_path / bench.QUICK.folder
     table = pd.read_csv(folder / "prediction.csv")
     assert len(table) == 13 * 41 and (table.low <= table.high).all()
     for name in ("prediction.png", "strips.png"):
@@ -149,6 +151,43 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
     fewer = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--updates", "1"])
     assert isinstance(fewer.exception, ValueError)
     assert "has had 2 updates, not 1" in str(fewer.exception)
+
+
+@pytest.fixture
+def pre_trained(tmp_path):
+    """A model file, and a dataset of two robots, of whose trajectories one is too short."""
+    agent(max_action_dim=2).save(tmp_path / "model.zip")
+    with TrajectoryDataset.create(tmp_path / "data") as dataset:
+        dataset.extend([clock(60), clock(60), clock(20), clock(60), clock(50, speed=2)])
+    return tmp_path
+
+
+def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained, capsys):
+    model, data = WPT.load(pre_trained), TrajectoryDataset.open(pre_trained / "data")
+    rows = list(prediction.judge(model, data, episodes=2))
+    ways = ["world model", "copy last frame", "mean frame"]
+    assert [(r["robot"], r["prediction"]) for r in rows] == [
+        (robot, way) for robot in ("clock 1", "clock 2") for way in ways
+    ]
+    assert [r["trajectories"] for r in rows] == [2, 2, 2, 1, 1, 1]
+    copied = {r["robot"]: r for r in rows if r["prediction"] == "copy last frame"}
+    assert copied["clock 1"]["+10"] == pytest.approx(PIXELS * (10 / 255) ** 2, abs=0.1)
+    assert copied["clock 2"]["+10"] == pytest.approx(PIXELS * (20 / 255) ** 2, abs=0.1)
+
+
+def test_open_loop_draws_and_refuses_what_is_too_short(pre_trained):
+    words = ["open-loop", str(pre_trained), str(pre_trained / "data")]
+    ran = CliRunner().invoke(app, [*words, "--out", str(pre_trained / "seen")])
+    assert ran.exit_code == 0, ran.output
+    assert "clock 2" in ran.stdout
+    for name in ("prediction.png", "strips.png"):
+        assert min(imread(pre_trained / "seen" / name).shape[:2]) > 200
+    assert len(pd.read_csv(pre_trained / "seen" / "prediction.csv")) == 2 * 3 * 41
+    with TrajectoryDataset.create(pre_trained / "short") as dataset:
+        dataset.append(clock(43))
+    short = CliRunner().invoke(app, [*words[:2], str(pre_trained / "short")])
+    assert isinstance(short.exception, ValueError)
+    assert "44 images, but 5 filtered and 40 predicted" in str(short.exception)
 
 
 ROBOTS = ("walker", "cartpole")

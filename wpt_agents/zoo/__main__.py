@@ -11,7 +11,7 @@ import typer
 
 from wpt_agents.zoo import data_commands
 from wpt_agents.zoo.bench.command import bench
-from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers, print_table
 from wpt_agents.zoo.report.command import report
 
 app = typer.Typer(
@@ -262,6 +262,30 @@ def diagnose_model(
     from wpt_agents.zoo.trained import find_trained
 
     show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
+
+
+@app.command("open-loop")
+def judge_predictions(
+    model: Annotated[Path, typer.Argument(help="A model file, or a folder with a `model.zip`.")],
+    data: Annotated[Path, typer.Argument(help="A dataset that it was not trained on.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Of each robot, at most.")] = 8,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write `prediction.csv` and pictures into.")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Shows how well a world model predicts: its error by horizon, beside the simplest guesses.
+
+    Example: `python -m wpt_agents.zoo open-loop walker.zip data/held-out --out predictions`
+    """
+    from wpt_agents.dataset import TrajectoryDataset
+    from wpt_agents.wpt import WPT
+    from wpt_agents.zoo.prediction import judge
+
+    rows = judge(WPT.load(model, device=device), TrajectoryDataset.open(data), episodes, out)
+    print_table("Squared error of an image, as in Eq. (1)", list(rows))
+    if out is not None:
+        typer.echo(f"Pictures: {out.resolve()}")
 
 
 @app.command("push")

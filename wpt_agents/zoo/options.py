@@ -1,5 +1,6 @@
 """What several commands share: options, and how they take several values."""
 
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any
 
@@ -45,3 +46,22 @@ Workers = Annotated[
     int,
     typer.Option(min=1, help="Processes that collect data; runs at a time of `--engine local`."),
 ]
+
+
+def print_table(title: str, found: Sequence[Mapping[str, Any]]) -> None:
+    """Prints rows of several columns each; what a row lacks stays empty."""
+    from rich.table import Table
+
+    from wpt_agents.zoo.stages import console
+
+    columns = list(dict.fromkeys(key for row in found for key in row))
+    table = Table(title=title)
+    for name in columns:
+        table.add_column(name, overflow="fold")
+    for row in found:
+        table.add_row(*(_cell(row.get(key, "")) for key in columns))
+    console.print(table)
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

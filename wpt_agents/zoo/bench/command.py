@@ -14,6 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
+from wpt_agents.zoo.options import print_table
+
 Case = StrEnum(
     "Case",
     [
@@ -100,23 +102,5 @@ def _show(name: str, rows: Iterator[dict], as_json: bool) -> list[dict]:
         if as_json:
             typer.echo(json.dumps({"case": name, **row}))
     if not as_json:
-        _print_table(name, found)
+        print_table(name, found)
     return found
-
-
-def _print_table(title: str, found: list[dict]) -> None:
-    from rich.table import Table
-
-    from wpt_agents.zoo.stages import console
-
-    columns = list(dict.fromkeys(key for row in found for key in row))
-    table = Table(title=title)
-    for name in columns:
-        table.add_column(name, overflow="fold")
-    for row in found:
-        table.add_row(*(_cell(row.get(key, "")) for key in columns))
-    console.print(table)
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

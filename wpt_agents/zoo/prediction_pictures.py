@@ -1,4 +1,4 @@
-"""The pictures of `bench prediction`: errors over the horizon, and strips of frames."""
+"""The pictures of predictions: errors over the horizon, and strips of frames."""
 
 import io
 import os
@@ -17,6 +17,7 @@ from PIL import Image
 INK, MUTED = "#1f2933", "#8a94a0"
 # Okabe and Ito's colours, which the colour-blind tell apart; dashes help in print
 STYLES: dict[str, dict[str, Any]] = {
+    "world model": {"color": "#0072b2", "lw": 2.4},
     "generalist": {"color": "#0072b2", "lw": 2.4},
     "specialist": {"color": "#e69f00", "lw": 2.4},
     "untrained": {"color": MUTED, "ls": ":", "lw": 1.6},
@@ -26,7 +27,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "left out, then": {"color": "#009e73", "lw": 2.4},
     "from scratch": {"color": "#56b4e9", "lw": 2.4},
 }
-COMMON = tuple(STYLES)[:5]  # compared on every robot
+COMMON = tuple(STYLES)[:6]  # compared on every robot
 
 
 class Curve(NamedTuple):
@@ -52,18 +53,21 @@ def style(prediction: str) -> dict[str, Any]:
     return STYLES[max((name for name in STYLES if prediction.startswith(name)), key=len)]
 
 
-def draw_curves(path: str | os.PathLike[str], curves: Sequence[Curve], left_out: str) -> None:
-    """A panel a robot, and one more for the robot that was left out of pre-training."""
+def draw_curves(
+    path: str | os.PathLike[str], curves: Sequence[Curve], left_out: str | None = None
+) -> None:
+    """A panel a robot, and one more for a robot that was left out of pre-training."""
     robots = list(dict.fromkeys(curve.robot for curve in curves))
-    figure, panels = _grid(len(robots) + 1, (3.6, 2.9))
+    figure, panels = _grid(len(robots) + (left_out is not None), (3.6, 2.9))
     for axes, robot in zip(panels, robots, strict=False):
         shown = [c for c in curves if c.robot == robot and c.prediction in COMMON]
         _panel(axes, robot, shown)
-    own = [c for c in curves if c.robot == left_out]
-    own = [c for c in own if c.prediction not in COMMON or c.prediction == "copy last frame"]
-    axes = panels[len(robots)]
-    _panel(axes, f"{left_out}, left out of pre-training", own)
-    axes.legend(frameon=False, fontsize=8)
+    if left_out is not None:
+        own = [c for c in curves if c.robot == left_out]
+        own = [c for c in own if c.prediction not in COMMON or c.prediction == "copy last frame"]
+        axes = panels[len(robots)]
+        _panel(axes, f"{left_out}, left out of pre-training", own)
+        axes.legend(frameon=False, fontsize=8)
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=5, frameon=False)
     figure.savefig(path, dpi=110)

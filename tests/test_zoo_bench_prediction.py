@@ -105,7 +105,7 @@ def test_a_row_counts_horizons_from_1_and_compares_within_trajectories():
     found[0, 1:], found[1, 1:], found[:, 0] = 2, 6, 99  # horizon 0 is no prediction
     told = prediction.row("arm", "x", found, found + 3)
     assert told["mean of 1 to 40"] == told["+1"] == told["+40"] == 4
-    assert told["95 %"] == "2.0 to 6.0" and told["trajectories"] == 2
+    assert told["95 %"] == "2.0 to 6.0" and told["episodes"] == 2
     # both trajectories are 3 below copying: paired, there is nothing left to chance
     assert told["minus copying"] == -3 and told["95 % "] == "-3.0 to -3.0"
 
@@ -133,7 +133,7 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
     more = ["left out", "left out, then 1 updates", "from scratch, 1 updates"]
     told = {robot: [r["prediction"] for r in rows if r["robot"] == robot] for robot in ROBOTS}
     assert told == {"walker": five + more, "cartpole": five}
-    assert all(row["+1"] >= 0 and row["trajectories"] == 2 for row in rows)
+    assert all(row["+1"] >= 0 and row["episodes"] == 2 for row in rows)
     folder = tmp_path / bench.QUICK.folder
     table = pd.read_csv(folder / "prediction.csv")
     assert len(table) == 13 * 41 and (table.low <= table.high).all()
@@ -169,7 +169,7 @@ def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained, cap
     assert [(r["robot"], r["prediction"]) for r in rows] == [
         (robot, way) for robot in ("clock 1", "clock 2") for way in ways
     ]
-    assert [r["trajectories"] for r in rows] == [2, 2, 2, 1, 1, 1]
+    assert [r["episodes"] for r in rows] == [2, 2, 2, 1, 1, 1]
     copied = {r["robot"]: r for r in rows if r["prediction"] == "copy last frame"}
     assert copied["clock 1"]["+10"] == pytest.approx(PIXELS * (10 / 255) ** 2, abs=0.1)
     assert copied["clock 2"]["+10"] == pytest.approx(PIXELS * (20 / 255) ** 2, abs=0.1)

@@ -161,7 +161,7 @@ def row(robot: str, name: str, found: np.ndarray, copied: np.ndarray) -> dict[st
     return {
         "robot": robot,
         "prediction": name,
-        "trajectories": len(found),
+        "episodes": len(found),
         **{f"+{h}": round(float(found[:, h].mean()), 1) for h in TOLD},
         f"mean of 1 to {HORIZON}": round(float(mean), 1),
         "95 %": f"{low:.1f} to {high:.1f}",

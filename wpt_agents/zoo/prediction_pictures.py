@@ -69,7 +69,9 @@ def draw_curves(
         _panel(axes, f"{left_out}, left out of pre-training", own)
         axes.legend(frameon=False, fontsize=8)
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=5, frameon=False)
+    figure.legend(
+        handles, names, loc="outside upper center", ncols=2 * min(3, len(panels)) - 1, frameon=False
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -121,11 +123,11 @@ def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:
 
 
 def _grid(panels: int, each: tuple[float, float]) -> tuple[Any, list[Axes]]:
-    """A figure of three panels a row; what is left over stays empty."""
-    height = -(-panels // 3)
-    figure, axes = plt.subplots(
-        height, 3, figsize=(3 * each[0], height * each[1]), layout="constrained", squeeze=False
-    )
+    """A figure of three panels a row, or fewer if there are no more; what is left over is empty."""
+    columns = min(3, panels)
+    height = -(-panels // columns)
+    size = columns * each[0], height * each[1]
+    figure, axes = plt.subplots(height, columns, figsize=size, layout="constrained", squeeze=False)
     for empty in axes.flat[panels:]:
         empty.set_visible(False)
     return figure, list(axes.flat)

@@ -16,10 +16,7 @@ import typer
 
 Case = StrEnum(
     "Case",
-    [
-        *("model", "scaling", "profile", "work", "policy", "replay", "data", "envs", "retrieval"),
-        *("prediction", "exploration", "all"),
-    ],
+    "model scaling profile work policy replay data envs retrieval prediction exploration all",
 )
 Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])

@@ -61,7 +61,7 @@ learn: $(INSTALLED)
 	@$(BIN)/python -m pytest tests/test_learning.py --seeds 3 -v --durations 3
 
 lint: $(INSTALLED)
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy wpt_agents envs
 
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache

@@ -7,7 +7,7 @@ not between two steps.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +38,7 @@ def norm_silu(x: Tensor, norm: nn.LayerNorm) -> Tensor:
     return F.silu(x, inplace=True)
 
 
-def linear_norm(layers: Iterable[nn.Module]) -> Layer:
+def linear_norm(layers: Iterable[Any]) -> Layer:
     """A `LinearNorm` as a Layer."""
     linear, norm, _ = layers
     return Layer(linear.weight.t(), linear.bias, norm)
@@ -74,7 +74,8 @@ class FastEncoder:
     """e(o), the four channels' vectors of its 2 x 2 pixels one after the other."""
 
     def __init__(self, encoder: Encoder) -> None:
-        convs, norms = encoder.layers[::3], encoder.layers[1::3]
+        layers = list[Any](encoder.layers)
+        convs, norms = layers[::3], layers[1::3]
         weights, biases = [conv.weight for conv in convs], [conv.bias for conv in convs]
         # `to_unit` within the first layer's weights
         biases[0] = biases[0] - 0.5 * weights[0].sum((1, 2, 3))
@@ -107,7 +108,7 @@ class FastFilter:
             [size.deter, rssm.post_in.in_features - size.deter], 1
         )
         pixels = from_embed.unflatten(1, (-1, 2, 2)).permute(0, 2, 3, 1).flatten(1)
-        norm, _, self.post_out = rssm.post_out
+        norm, _, self.post_out = list[Any](rssm.post_out)
         self.post = Layer(torch.cat([from_deter, pixels], 1).t(), rssm.post_in.bias, norm)
 
     def __call__(
@@ -155,12 +156,12 @@ class FastActor:
     """The outputs of the actor's network, (N, 2 A)."""
 
     def __init__(self, actor: Actor) -> None:
-        block, self.norm, _, self.from_deter = actor.from_deter
+        block, self.norm, _, self.from_deter = list[Any](actor.from_deter)
         self.block, self.blocks = block.weight, len(block.weight)
         self.block_bias = block.bias.view(self.blocks, 1, -1)
         self.from_stoch = actor.from_stoch
-        self.bias = actor.from_deter[-1].bias + actor.from_stoch.bias
-        *hidden, self.last = actor.layers
+        self.bias = self.from_deter.bias + actor.from_stoch.bias
+        *hidden, self.last = list[Any](actor.layers)
         self.hidden = [linear_norm(layers) for layers in hidden]
 
     def __call__(self, state: Latent) -> Tensor:
@@ -181,7 +182,7 @@ class FastStep:
         self.networks = encoder, rssm, actor
         self.encode, self.filter = FastEncoder(encoder), FastFilter(rssm)
         self.outputs = FastActor(actor)
-        self.places = [
+        self.places: list[tuple[dict[str, Any], str]] = [
             (module._parameters, name)
             for network in self.networks
             for module in network.modules()
@@ -191,13 +192,13 @@ class FastStep:
         self.held = [where[name].detach() for where, name in self.places]  # no address serves twice
 
     @staticmethod
-    def takes(encoder: nn.Module, rssm: nn.Module, actor: nn.Module) -> bool:
+    def takes(encoder: Encoder, rssm: RSSM, actor: Actor) -> bool:
         """Whether these are the networks that are known here, on a CPU, and count their changes."""
         known = type(encoder) is Encoder and type(rssm) is RSSM and type(actor) is Actor
         bias = rssm.post_in.bias
         return known and bias.device.type == "cpu" and not bias.is_inference()
 
-    def is_of(self, encoder: nn.Module, rssm: nn.Module, actor: nn.Module) -> bool:
+    def is_of(self, encoder: Encoder, rssm: RSSM, actor: Actor) -> bool:
         """Whether this was made of these networks, and no weight has changed since.
 
         Changes are known by autograd's version counters; whoever steps a fused optimiser, which

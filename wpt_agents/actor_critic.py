@@ -85,8 +85,8 @@ class Actor(Head):
     def __init__(self, size: Size, action_dim: int, outscale: float = 1.0) -> None:
         super().__init__(size, 3, 2 * action_dim)
         with torch.no_grad():
-            self.layers[-1].weight.mul_(outscale)
-            self.layers[-1].bias.mul_(outscale)
+            for parameter in self.layers[-1].parameters():
+                parameter.mul_(outscale)
 
     def dist(self, feat: Tensor, mask: Tensor) -> TruncatedNormal:
         """The action distribution.

@@ -58,7 +58,7 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
 def check_spaces(env: VecEnv, max_action_dim: int) -> None:
     """Refuses an environment that WPT cannot act in; says when it will resize the images."""
     image, action = env.observation_space, env.action_space
-    shape = getattr(image, "shape", None) or ()
+    shape: tuple[int, ...] = getattr(image, "shape", None) or ()
     is_image = isinstance(image, spaces.Box) and image.dtype == np.uint8 and len(shape) == 3
     if not is_image or 3 not in (shape[0], shape[-1]):
         raise ValueError(

@@ -14,6 +14,8 @@ from wpt_agents.distributions import Drawn, exponential, uniform
 from wpt_agents.policy import Dream, WPTPolicy
 from wpt_agents.rssm import RSSM, Latent
 
+LoopBody = Callable[..., tuple[Tensor, Tensor, Tensor]]
+
 
 def compile_loops(policy: WPTPolicy, backend: str = "inductor") -> None:
     """Has a policy run the scan's steps and its dreams compiled, from their first call on.
@@ -22,12 +24,14 @@ def compile_loops(policy: WPTPolicy, backend: str = "inductor") -> None:
 
     :param backend: of `torch.compile`
     """
-    policy.world_model.rssm.loop_body = _loop_body(policy.world_model.rssm, backend)
-    policy.imagine = _imagine(policy, backend)
+    rssm = policy.world_model.rssm
+    rssm.loop_body = _loop_body(rssm, backend)  # type: ignore[method-assign]
+    policy.imagine = _imagine(policy, backend)  # type: ignore[method-assign]
 
 
-def _loop_body(rssm: RSSM, backend: str) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    define, size = rssm.loop_body, rssm.size
+def _loop_body(rssm: RSSM, backend: str) -> LoopBody:
+    define: LoopBody = rssm.loop_body
+    size = rssm.size
 
     def sampling(*inputs: Tensor, draw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return define(*inputs, Drawn([draw]))

@@ -133,14 +133,14 @@ class TrajectoryDataset(Conversions):
         :raises ValueError: no datasets, images of different sizes, a folder with something in it,
             or a damaged trajectory; those before it are kept
         """
-        datasets = [d if isinstance(d, TrajectoryDataset) else cls.open(d) for d in datasets]
-        metas = {dataset._meta: dataset.path for dataset in datasets}
+        opened = [d if isinstance(d, TrajectoryDataset) else cls.open(d) for d in datasets]
+        metas = {dataset._meta: dataset.path for dataset in opened}
         if len({meta.image_size for meta in metas}) != 1:
             found = ", ".join(f"{path} has {meta.image_size}" for meta, path in metas.items())
             raise ValueError(f"merge wants datasets of one image size: {found or 'none given'}")
         size, codecs = next(iter(metas)).image_size, {meta.codec for meta in metas}
         with cls.create(path, size, codecs.pop() if len(codecs) == 1 else "zstd") as merged:
-            for dataset in datasets:
+            for dataset in opened:
                 merged.extend(dataset)
         return cls.open(path, workers)
 

@@ -202,8 +202,9 @@ class Divided:
 
     def _in_step(self, last: bool) -> AbstractContextManager[None]:
         """The processes add up their gradients once an update, in the last pass."""
-        alone = last or not isinstance(self.objective, DistributedDataParallel)
-        return nullcontext() if alone else self.objective.no_sync()
+        if last or not isinstance(self.objective, DistributedDataParallel):
+            return nullcontext()
+        return self.objective.no_sync()
 
     @torch.no_grad()
     def _whole_kl(self, parts: list[Batch], seed: int) -> Callable[[Tensor], Tensor]:

@@ -19,7 +19,7 @@ class Share(Generator):
 
     def __new__(cls, device: torch.device | str, rows: int, first: int) -> "Share":
         """Torch's generators take their device here."""
-        return super().__new__(cls, device)
+        return super().__new__(cls, device)  # type: ignore[call-arg]  # torch's stub has no __new__
 
     def __init__(self, device: torch.device | str, rows: int, first: int) -> None:
         self.rows, self.first = rows, first

@@ -46,6 +46,9 @@ EXPLORE: Mapping[str, Any] = {
 class Scale(nn.Module):
     """Divides by a running mean, so that a reward is about 1 however surprise shrinks."""
 
+    mean: Tensor
+    weight: Tensor
+
     def __init__(self, keep: float = 0.99) -> None:
         super().__init__()
         self.keep = keep
@@ -165,10 +168,12 @@ def disagreement(prediction: Tensor) -> Tensor:
 class Explorer(WPT):
     """WPT from scratch whose reward is curiosity; `curiosity` is saved with the policy."""
 
+    curiosity: nn.Module
+
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.policy.curiosity = self._make_curiosity().to(self.device)
-        parts = [list(self.policy.curiosity.parameters())]
+        self.curiosity = self.policy.curiosity = self._make_curiosity().to(self.device)
+        parts = [list(self.curiosity.parameters())]
         self.curiosity_optimizer = self._optimizer(parts, float(self.learning_rate))
 
     def _make_curiosity(self) -> nn.Module:
@@ -199,6 +204,8 @@ class Explorer(WPT):
 class ICMExplorer(Explorer):
     """The reward head learns the forward model's error on real transitions."""
 
+    curiosity: ICM
+
     def _make_curiosity(self) -> ICM:
         return ICM(self.policy.size, self.max_action_dim)
 
@@ -209,7 +216,7 @@ class ICMExplorer(Explorer):
         generator: Generator,
         learn_reward: bool = False,
     ) -> Latent:
-        icm, within = self.policy.curiosity, ~batch.is_first[:, 1:]
+        icm, within = self.curiosity, ~batch.is_first[:, 1:]
         with self._autocast():
             read, surprise = icm(batch.image, batch.action)
             loss = icm_loss(read, batch.action[:, 1:], surprise, within, icm.forward_share)
@@ -230,6 +237,7 @@ class Plan2Explore(Explorer):
     the same everywhere. Nothing led to the first state of a replayed window, which is paid 0.
     """
 
+    curiosity: Ensemble
     arrival: Tensor  # (B*T,), of the replayed states that the next dream starts from
 
     def _make_curiosity(self) -> Ensemble:
@@ -244,7 +252,7 @@ class Plan2Explore(Explorer):
         learn_reward: bool = False,
     ) -> Latent:
         post = super()._update_world_model(batch, metrics, generator)  # never the task's reward
-        ensemble, within = self.policy.curiosity, ~batch.is_first[:, 1:]
+        ensemble, within = self.curiosity, ~batch.is_first[:, 1:]
         with self._autocast():
             with torch.no_grad():
                 embed = self.policy.world_model.encoder(batch.image[:, 1:])
@@ -259,7 +267,7 @@ class Plan2Explore(Explorer):
         return post
 
     def _imagined_reward(self, dream: Dream) -> Tensor:
-        ensemble, feat = self.policy.curiosity, dream.states.feat
+        ensemble, feat = self.curiosity, dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
         assert len(self.arrival) == len(surprise), (self.arrival.shape, surprise.shape)

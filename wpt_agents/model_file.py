@@ -4,8 +4,9 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
@@ -17,12 +18,12 @@ from wpt_agents.archive import replacing
 
 KIND, VERSION = "wpt_agents model", 1
 ABOUT, TENSORS = "about.json", ".safetensors"
-FAULTS = (zipfile.BadZipFile, SafetensorError, EOFError, OSError)
+FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, SafetensorError, EOFError, OSError)
 FAULTS += (KeyError, RuntimeError, TypeError, ValueError)  # so fail zipfile and json on nonsense
 
 
 def write_model(
-    path: str | os.PathLike[str] | BinaryIO,
+    path: str | os.PathLike[str] | BufferedIOBase,
     about: Mapping[str, Any],
     tensors: Mapping[str, Mapping[str, Tensor]],
 ) -> None:
@@ -35,7 +36,7 @@ def write_model(
 
 
 def _write(
-    file: BinaryIO, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+    file: BufferedIOBase, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
     # ZipInfo has no time of day in it: equal models are equal bytes
     with zipfile.ZipFile(file, "w") as archive:
@@ -47,7 +48,7 @@ def _write(
 
 
 def read_model(
-    path: str | os.PathLike[str] | BinaryIO,
+    path: str | os.PathLike[str] | BufferedIOBase,
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     """Reads what `write_model` wrote, every byte checked.
 
@@ -62,7 +63,7 @@ def read_model(
         return _read(file, str(path))
 
 
-def _read(file: BinaryIO, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     try:
         with zipfile.ZipFile(file) as archive:
             groups = _members(archive)

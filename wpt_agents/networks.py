@@ -125,13 +125,13 @@ class Encoder(nn.Module):
         for inputs, outputs in itertools.pairwise(channels):
             layers += [DownConv(inputs, outputs, 4), ChannelNorm(outputs), nn.SiLU()]
         self.layers = nn.Sequential(*layers)
-        self.embed_dim = 8 * depth * 2 * 2
+        self.depth, self.embed_dim = depth, 8 * depth * 2 * 2
 
     def forward(self, image: Tensor) -> Tensor:
         """(..., 64, 64, channels_in) uint8 -> (..., E)."""
         assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
         x = to_unit(image).flatten(0, -4).permute(0, 3, 1, 2)  # channels_last in memory
-        x = in_pieces(self.layers, x, 31 * 31 * self.layers[0].out_channels)
+        x = in_pieces(self.layers, x, 31 * 31 * self.depth)
         return x.flatten(1).unflatten(0, image.shape[:-3])
 
 
@@ -142,10 +142,12 @@ class UpConv(nn.ConvTranspose2d):
     parities are four ordinary convolutions of the input, here done at once. Exactly the same sums.
     """
 
+    bias: Tensor
+
     def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
         super().__init__(inputs, outputs, kernel, stride=2)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # its size is no choice
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
         inputs, outputs, kernel, _ = self.weight.shape
         weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
@@ -161,7 +163,7 @@ class UpConv(nn.ConvTranspose2d):
 class FromPixel(nn.ConvTranspose2d):
     """A transposed convolution of a single pixel, computed as the matrix product that it is."""
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
         """(N, inputs, 1, 1) -> (N, outputs, K, K), channels last in memory."""
         assert x.shape[-2:] == (1, 1), x.shape
         weight = self.weight.permute(0, 2, 3, 1)  # (inputs, K, K, outputs)
@@ -219,11 +221,12 @@ class Head(nn.Module):
         )
         self.from_stoch = nn.Linear(size.stoch * size.classes, size.units)
         hidden = [LinearNorm(size.units, size.units) for _ in range(layers)]
-        self.layers = nn.Sequential(*hidden, nn.Linear(size.units, outputs))
+        last = nn.Linear(size.units, outputs)
+        self.layers = nn.Sequential(*hidden, last)
         self.deter_dim, self.units = size.deter, size.units
         if zero_init:
-            nn.init.zeros_(self.layers[-1].weight)
-            nn.init.zeros_(self.layers[-1].bias)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
 
     def forward(self, feat: Tensor) -> Tensor:
         """(..., D + S*K) -> (..., outputs)."""

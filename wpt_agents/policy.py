@@ -33,7 +33,7 @@ class Dream(NamedTuple):
     saturated: Tensor  # scalar, the share of means beyond 0.99
 
 
-def to_images(observation: np.ndarray) -> tuple[np.ndarray, bool]:
+def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarray, bool]:
     """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
 
     Takes (H, W, 3) and (3, H, W), one or a batch; other sizes are resized.
@@ -68,6 +68,10 @@ class WPTPolicy(BasePolicy):
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
     """
+
+    action_space: spaces.Box
+    action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
+    return_scale: Tensor  # scalar, what returns are divided by
 
     def __init__(
         self,
@@ -212,7 +216,9 @@ class WPTPolicy(BasePolicy):
         action = self.to_env(action)
         return (action if batched else action[0]), state
 
-    def _predict(self, observation: Tensor, deterministic: bool = False) -> Tensor:
+    def _predict(  # type: ignore[override]  # images alone, no dictionaries of them
+        self, observation: Tensor, deterministic: bool = False
+    ) -> Tensor:
         """SB3's stateless form: every observation is taken for an episode's first."""
         images, _ = to_images(observation.cpu().numpy())
         return self._tensor(self.to_env(self.act(images, None, None, deterministic)[0]))

@@ -30,7 +30,6 @@ class Pretraining(Updates, Saving):
     """What `WPT` learns without a task."""
 
     set_dataset: Callable[[Data | None], None]
-    set_env: Callable[[GymEnv | str], None]
     pretrain_steps: int
 
     @classmethod
@@ -67,7 +66,7 @@ class Pretraining(Updates, Saving):
         cls._check_keywords(kwargs)
         kwargs["device"] = local_device(kwargs.get("device", "auto"))
         with joined(kwargs["device"]) as world:
-            model = cls(size=size, seed=_common(world, seed), **kwargs)
+            model: Self = cls(size=size, seed=_common(world, seed), **kwargs)
             with world.rank_0_first():
                 model.set_dataset(dataset)
             path = Path(run_dir) / "model.zip" if run_dir is not None else None

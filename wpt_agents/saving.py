@@ -5,9 +5,10 @@
 
 import inspect
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -38,6 +39,8 @@ COUNTERS = (  # where a model stands, besides its weights
 class Saving:
     """What of a model is written to its file, and how it is read back."""
 
+    __init__: Callable[..., None]
+    set_env: Callable[..., None]
     hyperparameters: dict[str, Any]
     action_space: spaces.Box
     dataset: TrajectoryDataset | None
@@ -49,7 +52,7 @@ class Saving:
 
     def save(
         self,
-        path: str | os.PathLike[str] | BinaryIO,
+        path: str | os.PathLike[str] | BufferedIOBase,
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
@@ -77,7 +80,7 @@ class Saving:
     @classmethod
     def load(
         cls,
-        path: str | os.PathLike[str] | BinaryIO,
+        path: str | os.PathLike[str] | BufferedIOBase,
         env: GymEnv | str | None = None,
         device: torch.device | str = "auto",
         custom_objects: Mapping[str, Any] | None = None,
@@ -99,7 +102,7 @@ class Saving:
             path = inside if inside.exists() else path.with_suffix(path.suffix or ".zip")
         cls._check_keywords(kwargs)
         about, tensors = read_model(path)
-        model = cls(device=device, **{**about["hyperparameters"], **kwargs})
+        model: Self = cls(device=device, **{**about["hyperparameters"], **kwargs})
         low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
         model.action_space = spaces.Box(low, high)
         model.policy.set_action_space(model.action_space)
@@ -143,7 +146,7 @@ class Saving:
 
     @classmethod
     def _check_keywords(cls, kwargs: Mapping[str, Any]) -> None:
-        valid = set(inspect.signature(cls.__init__).parameters) - {"self", "_init_setup_model"}
+        valid = set(inspect.signature(cls).parameters) - {"_init_setup_model"}
         for name in kwargs:
             if name not in valid:
                 raise unknown_name("keyword", name, valid)

@@ -41,7 +41,9 @@ class Linear(Tape):
     def forward(self, x: Tensor, bias: Tensor | None = None) -> Tensor:
         """(N, inputs) -> (N, outputs)."""
         self.seen.append(x)
-        return torch.addmm(self.bias if bias is None else bias, x, self.transposed)
+        bias = self.bias if bias is None else bias
+        assert bias is not None, "neither the layer nor the step has a bias"
+        return torch.addmm(bias, x, self.transposed)
 
     def backward(self, slope: Tensor, other: Tensor | None = None) -> Tensor:
         """(N, outputs) -> (N, inputs), plus `other`."""

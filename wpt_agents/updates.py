@@ -206,10 +206,10 @@ class Updates:
         """What `_descend` does once the gradients of `loss` are there."""
         groups = [group["params"] for group in optimizer.param_groups]
         norms = [clip_grad_norm_(weights, self.grad_clip) for weights in groups]
-        if not torch.isfinite(sum(norms) + loss.detach()):
+        if not torch.isfinite(sum(norms, loss.detach())):
             raise FloatingPointError(
                 f"The {name} loss is {loss.item()} at update {self.updates}, its gradient norm "
-                f"{sum(norms).item()}; this step was not taken and the weights are finite: save "
+                f"{float(sum(norms))}; this step was not taken and the weights are finite: save "
                 "them, and look at the data or lower the learning rate"
             )
         optimizer.step()

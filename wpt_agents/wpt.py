@@ -115,6 +115,27 @@ class WPT(Pretraining, BaseAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"WPTPolicy": WPTPolicy}
     policy: WPTPolicy
+    policy_class: type[WPTPolicy]
+    action_space: spaces.Box
+    _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
+    _last_episode_starts: np.ndarray
+    # Keywords that `__init__` sets, beside those that `Updates` names.
+    learning_rate: float
+    embodiment: str | None
+    unimix: float
+    zero_init_heads: bool | None
+    actor_outscale: float
+    train_ratio: float
+    train_freq: str
+    learning_starts: int
+    warmup_steps: int
+    episode_length: int | None
+    num_retrieve: int
+    retrieval: str
+    bc_steps: int
+    bc_batch_size: int
+    bc_learning_rate: float
+    compile: bool
 
     def __init__(
         self,
@@ -180,7 +201,7 @@ class WPT(Pretraining, BaseAlgorithm):
             seed=seed,
             support_multi_env=True,
         )
-        self.stream_seed = int(np.random.SeedSequence().entropy % 2**31)  # unless a seed is given
+        self.stream_seed = torch_seed(np.random.default_rng())  # unless a seed is given
         self.observation_space, self.n_envs = IMAGE_SPACE, 1
         self.action_space = spaces.Box(-1.0, 1.0, (max_action_dim,), np.float32)
         self.schedule = parse_schedule(guidance)
@@ -264,6 +285,7 @@ class WPT(Pretraining, BaseAlgorithm):
         """
         wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
         check_spaces(wrapped, self.max_action_dim)
+        assert isinstance(wrapped.action_space, spaces.Box)
         if self.episodes and wrapped.action_space.shape != self.action_space.shape:
             self.reset_task()
         self.env, self.n_envs = wrapped, wrapped.num_envs
@@ -421,8 +443,8 @@ class WPT(Pretraining, BaseAlgorithm):
     def _open_rollout(self) -> Rollout:
         if self._rollout is None or self._last_episode_starts.all():
             self._rollout = Rollout(self.policy, self.n_envs, self._draw_window, self.embodiment)
-            generator = self.policy.generator
-            generator.manual_seed(torch_seed(self._stream(ACT, self.episodes)))
+            assert self.policy.generator is not None
+            self.policy.generator.manual_seed(torch_seed(self._stream(ACT, self.episodes)))
         return self._rollout
 
     def _draw_window(self) -> tuple[int, int]:

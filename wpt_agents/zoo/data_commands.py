@@ -222,7 +222,10 @@ def show_retrieval(
     query: Annotated[
         list[int], typer.Option(help="Trajectories of the dataset to search for, by number.")
     ] = [],  # noqa: B006
-    task: Annotated[list[str], typer.Option(help="Tasks whose first image to search for.")] = [],  # noqa: B006
+    task: Annotated[
+        list[str],
+        typer.Option(help="Tasks whose first image to search for."),
+    ] = [],  # noqa: B006
     suite: Suite = "dmc",
     rendering: Annotated[Rendering, typer.Option(help="Of --task.")] = Rendering.near,
     number: Annotated[int, typer.Option(min=1, help="How many of the nearest.")] = 8,

@@ -8,12 +8,13 @@ taken does, the dynamics are wrong; where the critic alone promises more, the cr
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import astuple, dataclass, replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import torch
 from rich.table import Table
-from torch import Generator
+from torch import Generator, Tensor
 
 from wpt_agents.policy import WPTPolicy
 from wpt_agents.rssm import Latent
@@ -66,14 +67,18 @@ def promises(
     for start in starts:
         state = Latent(*(x[:, start].repeat_interleave(SAMPLES, 0) for x in post))
         taken = batch.action[:, start + 1 : start + 1 + horizon].expand(SAMPLES, -1, -1)
-        same, _ = model.rssm.imagine(state, lambda _, t, a=taken: a[:, t], horizon, generator)
+        same, _ = model.rssm.imagine(state, partial(_taken, taken), horizon, generator)
         own, _ = model.rssm.imagine(state, lambda s, _: _mode(policy, s), horizon, generator)
+        same_actions, own_actions = (
+            float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, own)
+        )
         rest = trajectory.reward[start:]
         found.append(
             Promise(
                 start,
                 float(rest[:horizon].mean()),
-                *(float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, own)),
+                same_actions,
+                own_actions,
                 float(value[start]),
                 float(rest @ gamma ** np.arange(len(rest))),
             )
@@ -81,7 +86,11 @@ def promises(
     return found
 
 
-def _mode(policy: WPTPolicy, state: Latent) -> torch.Tensor:
+def _taken(actions: Tensor, _: Latent, t: int) -> Tensor:
+    return actions[:, t]
+
+
+def _mode(policy: WPTPolicy, state: Latent) -> Tensor:
     return policy.actor.dist(state.feat, policy.action_mask).mode
 
 

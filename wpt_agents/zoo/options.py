@@ -13,7 +13,7 @@ class Spaced(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Repeats the option's name before each further value."""
-        several = {o for p in self.params if p.multiple for o in p.opts}  # type: ignore[attr-defined]
+        several = {o for p in self.params if p.multiple for o in p.opts}
         spread: list[str] = []
         option, given = None, False
         for arg in args:

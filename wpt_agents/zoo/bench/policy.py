@@ -26,7 +26,7 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
             image = np.random.default_rng(0).integers(0, 256, (n, 64, 64, 3)).astype(np.uint8)
             state, first = policy.initial_state(n), np.zeros(n, bool)
             act = partial(policy.act, image, state, first)
-            forms = {
+            forms: dict[str, Callable[[], Any]] = {
                 "policy step": act,
                 "policy step, by definition": partial(defined, policy, act),
             }

@@ -104,7 +104,7 @@ def split(data: TrajectoryDataset, plan: Plan) -> tuple[TrajectoryDataset, Traje
 
 def of(dataset: TrajectoryDataset, *robots: str) -> TrajectoryDataset:
     """The trajectories of these robots."""
-    return dataset.subset(np.flatnonzero(np.isin(dataset.embodiments, robots)))
+    return dataset.subset(np.flatnonzero([name in robots for name in dataset.embodiments]))
 
 
 def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Predict]]:

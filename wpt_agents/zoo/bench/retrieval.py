@@ -29,9 +29,9 @@ METAWORLD = (
     *("pick-place", "plate-slide", "soccer", "window-open"),
 )
 TASK_IDS = [f"wpt/dmc-{name}-v0" for name in DMC] + [f"wpt/metaworld-{n}-v0" for n in METAWORLD]
-LOOK = {"rendering": "fast"}
+LOOK: dict[str, Any] = {"rendering": "fast"}
 EPISODES, STEPS, NEAREST, QUERIES = 20, 2000, 10, 10
-MODEL = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
+MODEL: dict[str, Any] = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
 PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
 
 Embed = Callable[[np.ndarray], np.ndarray]  # (n, 64, 64, 3) uint8 -> (n, E) float32

@@ -67,7 +67,8 @@ def gflop(step: Callable[[], Any]) -> float:
     computes it here; what is not matmul or convolution counts nothing.
     """
     counter = FlopCounterMode(display=False)
-    counter.mod_tracker = _Everything()  # its own walks through the modules, some of which mind
+    # its own walks through the modules, some of which mind
+    counter.mod_tracker = _Everything()  # type: ignore[assignment]
     with _by_definition(), counter:
         step()
     return counter.get_total_flops() / 1e9
@@ -84,14 +85,14 @@ def _by_definition() -> Iterator[None]:
     def plain(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
         return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
 
-    fast = {kind: kind.forward for kind in (UpConv, FromPixel)}
+    fast: dict[Any, Any] = {kind: kind.forward for kind in (UpConv, FromPixel)}
     for kind in fast:
-        kind.forward = plain  # type: ignore[method-assign]
+        kind.forward = plain
     try:
         yield
     finally:
         for kind, forward in fast.items():
-            kind.forward = forward  # type: ignore[method-assign]
+            kind.forward = forward
 
 
 def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:

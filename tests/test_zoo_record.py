@@ -7,6 +7,7 @@ from run_folders import make_run
 from typer.testing import CliRunner
 
 from wpt_agents.zoo.__main__ import app
+from wpt_agents.zoo.plan import METHODS
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
 
@@ -127,3 +128,14 @@ def test_the_pages_table_is_the_records():
     told = record.markdown(lines)
     assert told in (root / "docs" / "small-benchmark.md").read_text()
     assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()
+
+
+def test_methods_are_told_from_doing_nothing_to_ours():
+    assert set(METHODS) < set(record.ORDER)
+    told = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
+    lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(told)]
+    shown = sorted(lines, key=record._order)
+    assert [x.method for x in shown] == 2 * told and [x.task for x in shown] == 6 * ["a"] + 6 * [
+        "b"
+    ]
+    assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]

@@ -58,6 +58,10 @@ class Line:
 
 
 WPT_CLONES = "wpt", "kickstart", "no-rehearsal"  # methods whose prior actor is wpt's
+ORDER = (  # in which methods are told: what needs no learning first, the paper's ablation, ours
+    *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
+    *("no-rehearsal", "random-retrieval", "no-pretrain", "wpt", "kickstart"),
+)
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
 
 
@@ -106,8 +110,15 @@ def command(result: Mapping[str, Any]) -> str:
     return shlex.join(words)
 
 
-def _order(line: Line) -> tuple[str, str, str, str, int, int]:
-    return line.suite, line.task, line.method, line.preset, line.frames, line.seed
+def _order(line: Line) -> tuple[str, str, int, str, str, int, int]:
+    place = _place(line.method)
+    return line.suite, line.task, place, line.method, line.preset, line.frames, line.seed
+
+
+def _place(method: str) -> int:
+    """Where a method is told; "wpt, last" where "wpt" is, unknown ones at the end."""
+    name = method.split(",")[0]
+    return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
 def update(path: Path, lines: Iterable[Line]) -> list[Line]:
@@ -196,7 +207,7 @@ def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, tuple[int, Cell]]]:
         name += f", {line.preset}" if line.preset not in ("", preset) else ""
         suites = groups.setdefault(name, {})
         suites.setdefault(line.suite, defaultdict(list))[line.task].append(line.score)
-    return {method: _means(suites) for method, suites in groups.items()}
+    return {method: _means(groups[method]) for method in sorted(groups, key=_place)}
 
 
 def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, tuple[int, Cell]]:

@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -45,6 +46,7 @@ def imports(name, path):
             yield from (f"{source}.{alias.name}" for alias in node.names)
 
 
+@cache
 def within(package):
     """The imports of each module of `package` that stay inside it."""
     names = {name for name, _ in modules(package)}

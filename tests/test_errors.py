@@ -192,9 +192,8 @@ def test_observations_that_are_not_bytes_stop_and_nothing_of_them_is_stored():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
 
 
-def poison(monkeypatch, name, after):
-    """From call `after` on, the loss of this name is NaN."""
-    module = updates if hasattr(updates, name) else wpt  # whichever calls it
+def poison(monkeypatch, name, after, module=updates):
+    """From call `after` on, the loss of this name is NaN where `module` calls it."""
     function, calls = getattr(module, name), []
 
     def spoilt(*args, **kwargs):
@@ -228,7 +227,7 @@ def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network
 
 def test_a_clone_whose_loss_is_nan_stops_with_finite_weights(monkeypatch):
     model = pretrained([recorded()], env=DotEnv())
-    poison(monkeypatch, "bc_loss", after=1)
+    poison(monkeypatch, "bc_loss", after=1, module=wpt)
     with pytest.raises(FloatingPointError, match="bc loss is nan"):
         model.learn(LENGTH)
     assert finite(model) and model.prior is None

@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 from wpt_agents.networks import FromPixel, UpConv
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.bench import command, policy, profile, replay, scaling, timing, work
 from wpt_agents.zoo.bench import model as bench_model
+from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
+from wpt_agents.zoo.options import print_table
 
 KEYS = {
     *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
@@ -123,7 +124,7 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
 def test_a_table_shortens_nothing(monkeypatch, capsys):
     monkeypatch.setattr(Console, "size", ConsoleDimensions(60, 25))
     task = "metaworld-button-press-topdown-wall"
-    command._print_table("envs", [{"what": "step", "task": task, "a_long_heading_of_a_column": 1}])
+    print_table("envs", [{"what": "step", "task": task, "a_long_heading_of_a_column": 1}])
     told = capsys.readouterr().out
     joined = "".join(c for c in told if c.isalnum() or c in "-_")
     assert max(map(len, told.splitlines())) <= 60 and "…" not in told

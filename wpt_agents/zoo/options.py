@@ -57,7 +57,8 @@ def print_table(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     columns = list(dict.fromkeys(key for row in found for key in row))
     table = Table(title=title)
     for name in columns:
-        table.add_column(name, overflow="fold", min_width=max(map(len, name.split())))
+        widest = max(map(len, name.split()))  # of its words, not to be broken where there is room
+        table.add_column(name, overflow="fold", min_width=min(widest, 12))
     for row in found:
         table.add_row(*(_cell(row.get(key, "")) for key in columns))
     console.print(table)

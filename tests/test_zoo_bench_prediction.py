@@ -175,7 +175,7 @@ def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained, cap
     assert copied["clock 2"]["+10"] == pytest.approx(PIXELS * (20 / 255) ** 2, abs=0.1)
 
 
-def test_open_loop_draws_and_refuses_what_is_too_short(pre_trained):
+def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
     words = ["open-loop", str(pre_trained), str(pre_trained / "data")]
     ran = CliRunner().invoke(app, [*words, "--out", str(pre_trained / "seen")])
     assert ran.exit_code == 0, ran.output
@@ -188,6 +188,12 @@ def test_open_loop_draws_and_refuses_what_is_too_short(pre_trained):
     short = CliRunner().invoke(app, [*words[:2], str(pre_trained / "short")])
     assert isinstance(short.exception, ValueError)
     assert "44 images, but 5 filtered and 40 predicted" in str(short.exception)
+    still = noise(46)
+    with TrajectoryDataset.create(pre_trained / "wide") as dataset:
+        dataset.append(Trajectory(still, np.zeros((45, 3), np.float32)))
+    wide = CliRunner().invoke(app, [*words[:2], str(pre_trained / "wide")])
+    assert isinstance(wide.exception, ValueError)
+    assert "3 actions, the model at most max_action_dim=2" in str(wide.exception)
 
 
 ROBOTS = ("walker", "cartpole")

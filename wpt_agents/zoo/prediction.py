@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Generator
 
+from wpt_agents.checks import check_dataset
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Batch, Trajectory, led_to, stack_windows
 from wpt_agents.wpt import WPT
@@ -37,6 +38,7 @@ def judge(
     :param folder: where to draw
     :raises ValueError: no trajectory is long enough, or one has more actions than the model takes
     """
+    check_dataset(dataset, model.max_action_dim, batch_length=1)
     ways: dict[str, dict[str, Predict]] = {}
     tests: dict[str, list[Batch]] = {}
     names = np.array([name or "unnamed" for name in dataset.embodiments])

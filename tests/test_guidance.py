@@ -52,10 +52,11 @@ def test_another_schedule_is_refused_with_an_example(text):
 
 def test_a_weight_may_be_larger_than_a_probability():
     assert parse_schedule("linear(20,4,100)", most=np.inf)(50) == pytest.approx(12)
-    with pytest.raises(ValueError, match="from 0 to 1,"):
+    with pytest.raises(ValueError, match=r"guidance='linear.*from 0 to 1,"):
         parse_schedule("linear(20,4,100)")
-    with pytest.raises(ValueError, match="from 0 to inf,"):
-        parse_schedule(-1, most=np.inf)
+    for wrong in (-1, np.inf, "linear(1e999,0,10)"):
+        with pytest.raises(ValueError, match=r"kickstart=.*a number from 0 on,"):
+            parse_schedule(wrong, np.inf, "kickstart")
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 25, 100, 500])

@@ -79,13 +79,17 @@ def test_a_dotted_name_never_loads_another_file(tmp_path):
         WPT.load(tmp_path / "model.v2")
 
 
-def test_a_run_folder_is_loaded_by_its_model(tmp_path):
-    (tmp_path / "walker_0").mkdir()
-    agent(ClockEnv(), gamma=0.9).save(tmp_path / "walker_0" / "model.zip")
-    assert WPT.load(tmp_path / "walker_0").gamma == 0.9
-    agent(ClockEnv(), gamma=0.8).save(tmp_path / "cheetah")
-    (tmp_path / "cheetah").mkdir()  # a folder of other things beside cheetah.zip
-    assert WPT.load(tmp_path / "cheetah").gamma == 0.8
+def test_a_folder_is_refused_with_the_files_it_holds(tmp_path):
+    run = tmp_path / "walker_0"
+    run.mkdir()
+    with pytest.raises(FileNotFoundError, match="walker_0 is a folder, which holds no model file"):
+        WPT.load(run)
+    for name in ("model", "best_model"):
+        agent(ClockEnv()).save(run / name)
+    with pytest.raises(FileNotFoundError, match=r"holds best_model.zip, model.zip: give the file"):
+        WPT.load(run)
+    agent(ClockEnv(), gamma=0.8).save(tmp_path / "walker_0")  # beside the folder
+    assert WPT.load(tmp_path / "walker_0").gamma == 0.8
 
 
 def test_the_file_is_json_and_safetensors_and_holds_no_data(learnt, tmp_path):

@@ -1,6 +1,7 @@
 """Algorithm 1 from end to end, and each of its stages on its own."""
 
 from collections import defaultdict
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -527,18 +528,27 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
             own = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
             error = (own - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
             by_hand += [error.mean().item()] * (t >= 2)
-    loss = model._imitation(post, batch, defaultdict(list))
+    metrics = defaultdict(list)
+    loss = model._imitation(post, batch, metrics)
     assert model.num_timesteps == 50  # half way from 20 to 0
+    assert loss.item() == pytest.approx(10 * metrics["train/kickstart_loss"][0].item())
     assert loss.item() == pytest.approx(10 * np.mean(by_hand), rel=1e-4)
 
 
 def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
-    model = pretrained(store, env=DotEnv(), kickstart=5).learn(2 * LENGTH)
-    model.policy.zero_grad()
-    model._imitation(*replayed(model), defaultdict(list)).backward()
-    taught = {k.split(".")[0] for k, p in model.policy.named_parameters() if p.grad is not None}
-    assert taught == {"actor"}
-    assert pretrained(store, env=DotEnv()).learn(LENGTH)._imitation(None, None, {}) == 0
+    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
+    policy, before = model.policy, deepcopy(model.policy.state_dict())
+    taught = []
+    for weight in (0, 5):
+        policy.load_state_dict(before)
+        model._setup_optimizers()
+        model.kickstart_schedule = parse_schedule(weight, np.inf)
+        model.updates = 0
+        model.update(defaultdict(list))
+        taught.append(weights(model))
+    moved = {k.split(".")[0] for k in before if (taught[0][k] != taught[1][k]).any()}
+    assert moved == {"actor"}
+    assert WPT("WPTPolicy", size="debug").kickstart_schedule(0) == 0
 
 
 def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):

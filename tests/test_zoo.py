@@ -201,6 +201,20 @@ def test_a_finished_run_of_other_settings_is_refused_before_any_work(tmp_path):
     assert not job(tmp_path, seed=1).folder.exists()
 
 
+def test_a_run_from_before_a_keyword_was_there_is_the_same_run(tmp_path):
+    one = job(tmp_path, "scratch")
+    first = run(one)
+    path = one.folder / "config.yaml"
+    config = yaml.safe_load(path.read_text())
+    assert config["wpt"].pop("kickstart") == 0
+    path.write_text(yaml.safe_dump(config))
+    assert run(one) == first
+    config["wpt"]["kickstart"] = 3
+    path.write_text(yaml.safe_dump(config))
+    with pytest.raises(ValueError, match=r"other settings \(wpt.kickstart\)"):
+        run(one)
+
+
 def test_a_folder_that_is_no_run_is_never_deleted(tmp_path):
     one = job(tmp_path)
     one.folder.mkdir(parents=True)

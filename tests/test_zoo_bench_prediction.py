@@ -163,7 +163,7 @@ def pre_trained(tmp_path):
 
 
 def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained, capsys):
-    model, data = WPT.load(pre_trained), TrajectoryDataset.open(pre_trained / "data")
+    model, data = WPT.load(pre_trained / "model.zip"), TrajectoryDataset.open(pre_trained / "data")
     rows = list(prediction.judge(model, data, episodes=2))
     ways = ["world model", "copy last frame", "mean frame"]
     assert [(r["robot"], r["prediction"]) for r in rows] == [
@@ -193,7 +193,7 @@ def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
         dataset.append(Trajectory(still, np.zeros((45, 3), np.float32)))
     wide = CliRunner().invoke(app, [*words[:2], str(pre_trained / "wide")])
     assert isinstance(wide.exception, ValueError)
-    assert "3 actions, the model at most max_action_dim=2" in str(wide.exception)
+    assert "3 actions, the model takes at most 2: take other data" in str(wide.exception)
 
 
 ROBOTS = ("walker", "cartpole")

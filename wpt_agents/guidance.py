@@ -3,6 +3,7 @@
 Also the schedules, by which guidance and kickstarting fade out.
 """
 
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -22,10 +23,11 @@ def linear(start: float, end: float, duration: float) -> Schedule:
     return lambda step: start + (end - start) * min(max(step / duration, 0.0), 1.0)
 
 
-def parse_schedule(text: str | float, most: float = 1.0) -> Schedule:
+def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance") -> Schedule:
     """'linear(1,0,50000)' or a constant -> the schedule.
 
     :param most: the largest value allowed: 1 for a probability, infinite for a weight
+    :param name: the keyword that the schedule is of
     :raises ValueError: anything else
     """
     number = r"([-+0-9.eE_]+)"
@@ -33,16 +35,17 @@ def parse_schedule(text: str | float, most: float = 1.0) -> Schedule:
     try:
         if match:
             start, end, duration = (float(group) for group in match.groups())
-            if duration > 0 and all(0 <= value <= most for value in (start, end)):
+            if duration > 0 and all(0 <= x <= most and x < math.inf for x in (start, end)):
                 return linear(start, end, duration)
         else:
             constant = float(text)
-            if 0 <= constant <= most:
+            if 0 <= constant <= most and constant < math.inf:
                 return lambda step: constant
     except (ValueError, TypeError):
         pass
+    to = f"to {most:g}" if most < math.inf else "on"
     raise ValueError(
-        f"Schedule {text!r} is not understood: write a number from 0 to {most:g}, or "
+        f"{name}={text!r} is not understood: write a number from 0 {to}, or "
         "'linear(start,end,steps)' of two of them and steps > 0, for example 'linear(1,0,50000)'"
     )
 

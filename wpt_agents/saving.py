@@ -90,16 +90,15 @@ class Saving:
     ) -> Self:
         """Reads a model file onto any environment of at most `max_action_dim` actions.
 
-        :param path: as given to `save`, or a folder that holds a `model.zip`, as the zoo's do
+        :param path: as given to `save`
         :param env: the environment to go on with
         :param custom_objects: accepted for SB3's sake
         :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
         :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
+        :raises FileNotFoundError: there is none; in a folder, says which ones it holds
         """
         if isinstance(path, str | os.PathLike):
-            path = Path(path)
-            inside = path / "model.zip"
-            path = inside if inside.exists() else path.with_suffix(path.suffix or ".zip")
+            path = _model_file(Path(path))
         cls._check_keywords(kwargs)
         about, tensors = read_model(path)
         model: Self = cls(device=device, **{**about["hyperparameters"], **kwargs})
@@ -150,3 +149,12 @@ class Saving:
         for name in kwargs:
             if name not in valid:
                 raise unknown_name("keyword", name, valid)
+
+
+def _model_file(path: Path) -> Path:
+    """With the suffix that `save` adds where there is none."""
+    file = path if path.suffix else path.with_suffix(".zip")
+    if path.is_dir() and not file.is_file():
+        held = ", ".join(sorted(each.name for each in path.glob("*.zip"))) or "no model file"
+        raise FileNotFoundError(f"{path} is a folder, which holds {held}: give the file to load")
+    return file

@@ -152,7 +152,7 @@ class Updates:
     ) -> None:
         """Actor and critic on imagined trajectories, Eq. (2) to (4).
 
-        :param imitation: added to the actor's loss
+        :param imitation: added to the actor's loss, and not to what is logged of it
         """
         policy = self.policy
         with self._autocast():
@@ -166,8 +166,7 @@ class Updates:
                 spread = policy.return_scale.lerp(return_range(returns), 0.01)
                 scale = spread.clamp_min(1.0)
             loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
-            loss = loss + imitation
-        actor_norm = self._descend(self.actor_optimizer, loss, "actor")
+        actor_norm = self._descend(self.actor_optimizer, loss + imitation, "actor")
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():
             logits = policy.critic(feat[:, :-1].detach())

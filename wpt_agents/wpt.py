@@ -45,8 +45,9 @@ from wpt_agents.trajectory import Trajectory
 from wpt_agents.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
 NO_DATASET = (
-    "No dataset: nothing is rehearsed, no prior actor guides, and model.prior stays None. Give "
-    "dataset= to WPT or load, or say offline_ratio=0, guidance=0 if you mean it"
+    "No dataset: nothing is rehearsed, no prior actor guides or is imitated, and model.prior stays "
+    "None. Give dataset= to WPT or load, or say offline_ratio=0, guidance=0, kickstart=0 if you "
+    "mean it"
 )
 
 
@@ -96,8 +97,8 @@ class WPT(Pretraining, BaseAlgorithm):
     :param warmup_steps: steps driven by the prior actor alone (uniform random without one)
     :param offline_ratio: share of retrieved sequences in a batch; 0: no rehearsal
     :param guidance: schedule of the probability that an episode is guided; 0: none
-    :param kickstart: schedule of the weight at which the actor imitates the prior actor where
-        images are replayed: what the paper does not do, and 20 where the clone is good. 0: none
+    :param kickstart: weight, or schedule of it, at which the actor imitates the prior actor on the
+        replayed images; not in the paper. 0: off; where the clone is good, try 20
     :param episode_length: steps of an episode, for the guidance window; found out if None
     :param num_retrieve: R, trajectories to retrieve
     :param retrieval: "nearest", by Eq. (5), or "random", its ablation
@@ -205,7 +206,7 @@ class WPT(Pretraining, BaseAlgorithm):
         self.observation_space, self.n_envs = IMAGE_SPACE, 1
         self.action_space = spaces.Box(-1.0, 1.0, (max_action_dim,), np.float32)
         self.schedule = parse_schedule(guidance)
-        self.kickstart_schedule = parse_schedule(kickstart, most=np.inf)
+        self.kickstart_schedule = parse_schedule(kickstart, np.inf, "kickstart")
         if ever(self.kickstart_schedule) and batch_length < FRAMES:
             raise ValueError(
                 f"kickstart looks at {FRAMES} images in a row, but batch_length={batch_length}: "
@@ -380,7 +381,7 @@ class WPT(Pretraining, BaseAlgorithm):
         if len(found) == 0:
             raise ValueError(
                 f"The dataset {self.dataset.path} has no trajectory of {width} actions to "
-                "retrieve; add some, or learn with offline_ratio=0, guidance=0"
+                "retrieve; add some, or learn with offline_ratio=0, guidance=0, kickstart=0"
             )
         return [int(i) for i in found]
 

@@ -266,9 +266,13 @@ def diagnose_model(
 
 @app.command("open-loop")
 def judge_predictions(
-    model: Annotated[Path, typer.Argument(help="A model file, or a folder with a `model.zip`.")],
+    model: Annotated[
+        Path, typer.Argument(help="A model file, or a run's or pre-training's folder.")
+    ],
     data: Annotated[Path, typer.Argument(help="A dataset that it was not trained on.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Of each robot, at most.")] = 8,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Of each robot, at most, spread evenly.")
+    ] = 8,
     out: Annotated[
         Path | None, typer.Option(help="Folder to write `prediction.csv` and pictures into.")
     ] = None,
@@ -282,7 +286,8 @@ def judge_predictions(
     from wpt_agents.wpt import WPT
     from wpt_agents.zoo.prediction import judge
 
-    rows = judge(WPT.load(model, device=device), TrajectoryDataset.open(data), episodes, out)
+    file = model / "model.zip" if model.is_dir() else model
+    rows = judge(WPT.load(file, device=device), TrajectoryDataset.open(data), episodes, out)
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
         typer.echo(f"Pictures: {out.resolve()}")

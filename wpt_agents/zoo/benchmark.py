@@ -41,6 +41,7 @@ from wpt_agents.zoo.checkpoints import (
 )
 from wpt_agents.zoo.evaluation import Score, episode_steps, evaluate, film, make_vec_env
 from wpt_agents.zoo.plan import METHODS, Run
+from wpt_agents.zoo.presets import wpt_keywords
 from wpt_agents.zoo.progress import LearningBar
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.stages import BASELINES, console, locked, say, write_json
@@ -116,8 +117,9 @@ def check_folder(job: Run, force: bool) -> None:
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
-        before = _flat(yaml.safe_load(path.read_text()))
-        wanted = _flat(json.loads(json.dumps(job.config())))
+        usual = {f"wpt.{name}": value for name, value in wpt_keywords().items()}
+        before = usual | _flat(yaml.safe_load(path.read_text()))
+        wanted = usual | _flat(json.loads(json.dumps(job.config())))
         differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
         if differ:
             raise ValueError(

@@ -34,11 +34,16 @@ def judge(
     """Compares a world model with copying the last frame and with the mean frame, robot by robot.
 
     :param dataset: what the model was not trained on; its own mean frame is the one to beat
-    :param episodes: of each robot, at most; the first ones that are long enough
+    :param episodes: of each robot, at most; spread evenly over those that are long enough
     :param folder: where to draw
     :raises ValueError: no trajectory is long enough, or one has more actions than the model takes
     """
-    check_dataset(dataset, model.max_action_dim, batch_length=1)
+    check_dataset(dataset, max([1, *dataset.action_dims]), batch_length=1)
+    if (widest := max(dataset.action_dims)) > model.max_action_dim:
+        raise ValueError(
+            f"The dataset {dataset.path} has {widest} actions, the model takes at most "
+            f"{model.max_action_dim}: take other data, or a model pre-trained for as many"
+        )
     ways: dict[str, dict[str, Predict]] = {}
     tests: dict[str, list[Batch]] = {}
     names = np.array([name or "unnamed" for name in dataset.embodiments])
@@ -49,7 +54,9 @@ def judge(
             f"{CONTEXT} filtered and {HORIZON} predicted ones are asked for: take longer episodes"
         )
     for robot in dict.fromkeys(names[long].tolist()):
-        own = dataset.subset(np.flatnonzero(long & (names == robot))[:episodes])
+        found = np.flatnonzero(long & (names == robot))
+        spread = np.linspace(0, len(found) - 1, min(episodes, len(found))).round().astype(int)
+        own = dataset.subset(found[spread])
         tests[robot] = [windows(trajectory, 3, model.max_action_dim) for trajectory in own]
         ways[robot] = {
             "world model": dream(model),
@@ -122,7 +129,7 @@ def copy_last_frame(batch: Batch) -> np.ndarray:
 
 
 class MeanFrame:
-    """Predicts the mean of all training images, (64, 64, 3), whatever happens."""
+    """Predicts the mean of all images of a dataset, (64, 64, 3), whatever happens."""
 
     def __init__(self, dataset: TrajectoryDataset) -> None:
         total = sum(trajectory.image.sum(0, np.float64) for trajectory in dataset)

@@ -58,7 +58,7 @@ class Line:
 
 
 WPT_CLONES = "wpt", "kickstart", "no-rehearsal"  # methods whose prior actor is wpt's
-ORDER = (  # in which methods are told: what needs no learning first, the paper's ablation, ours
+ORDER = (  # in which methods are told: the simplest first, then the paper's ablation, ours
     *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
     *("no-rehearsal", "random-retrieval", "no-pretrain", "wpt", "kickstart"),
 )
@@ -67,7 +67,8 @@ COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
 
 def lines_of(runs: Iterable[Finished]) -> list[Line]:
     """The lines of run folders; untrained policies once a task and seed."""
-    found = {line.run: line for run in runs for line in _lines(run.result)}
+    last = sorted(runs, key=lambda run: run.result["method"] == "wpt")  # whose clone is told of
+    found = {line.run: line for run in last for line in _lines(run.result)}
     return sorted(found.values(), key=_order)
 
 

@@ -2,12 +2,14 @@
 
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from run_folders import make_run
 
+from wpt_agents.zoo.plan import METHODS
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.page import write_page
@@ -197,3 +199,12 @@ def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
     given = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
     assert given["mean"] == pytest.approx((0.728 + 0.9694) / 2)
     assert aggregates.paper_aggregate("dmc", tasks, "no-rehearsal", 150_000) == {}
+
+
+def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
+    used = {variable for variable in figures.VARIABLES.values() if "series" in variable}
+    assert len(used) == len(figures.SERIES) >= len(METHODS)
+    for variable in used:
+        assert page.count(f"{variable[4:-1]}: #") == 2
+    template = Path(figures.__file__).with_name("page.html.jinja").read_text()
+    assert f"% {len(figures.SERIES)} + 1" in template  # the key's

@@ -83,7 +83,7 @@ def test_another_csv_is_refused(tmp_path):
 
 def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
     lines = [
-        *[line("wpt", 0.0, task=f"dmc-{i}") for i in range(3)],
+        *[line("wpt", 0.0, f"dmc-{i}", seed) for i in range(3) for seed in range(2)],
         *[line("wpt", score, "mw-a", seed, 50, "mw") for seed, score in enumerate((80.0, 100.0))],
         *[line("scratch", 30.0, "mw-a", 0, 150, "mw"), line("random", 7.0, "mw-a", 0, 0, "mw")],
     ]
@@ -92,6 +92,8 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
     both = found["wpt"]["both"][1]
     assert (both.mean, both.low, both.high) == (45, 40, 50)
     assert found["scratch, 3x frames"]["mw"][1].low is None  # of one seed
+    fewer = record.by_suite([each for each in lines if (each.task, each.seed) != ("dmc-0", 1)])
+    assert fewer["wpt"]["mw"][1].low == 80 and fewer["wpt"]["both"][1].low is None  # one of them
     assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
 
 
@@ -139,3 +141,8 @@ def test_methods_are_told_from_doing_nothing_to_ours():
         "b"
     ]
     assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]
+
+
+def test_a_method_of_two_budgets_is_drawn_with_both():
+    keys = [("nothing", "", 0), ("scratch", "tiny", 100), ("scratch", "tiny", 3000)]
+    assert record._names(keys) == ["nothing", "scratch, 100 frames", "scratch, 3,000 frames"]

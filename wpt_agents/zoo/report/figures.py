@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 # Placeholders that matplotlib draws with and `svg` replaces by the page's CSS variables.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"
-SERIES = ("#a10001", "#a10002", "#a10003", "#a10004", "#a10005", "#a10006")
+SERIES = tuple(f"#a1000{number}" for number in range(1, 9))
 VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"} | {
     colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, 1)
 }
@@ -140,7 +140,8 @@ def bars(
                 axes.errorbar(place, value, error, color=INK, capsize=3, lw=1)
         texts = [f"{name}\n{value:.2f}" for name, (value, *_) in given.items()]
         axes.set_xticks(range(len(given)), texts)
-        axes.set(title=title, ylabel=y_label)
+        axes.set_title(title, wrap=True)
+        axes.set(ylabel=y_label)
         if not any(max(value, high or 0) > 0 for value, _, high in given.values()):
             axes.set_ylim(0, 1)  # nothing to see: an axis around 0 would look like a fault
         axes.grid(False, axis="x")

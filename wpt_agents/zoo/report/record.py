@@ -7,7 +7,7 @@ lines of runs that are gone stay, lines of the same run are replaced.
 import csv
 import io
 import shlex
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
@@ -57,6 +57,7 @@ class Line:
         return self.task, self.method, self.preset, self.frames, self.seed
 
 
+COLOURS = {"wpt": "#0072b2", "kickstart": "#d55e00"}
 WPT_CLONES = "wpt", "kickstart", "no-rehearsal"  # methods whose prior actor is wpt's
 ORDER = (  # in which methods are told: the simplest first, then the paper's ablation, ours
     *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
@@ -231,7 +232,7 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, tup
 
 def _cell(strata: Sequence[np.ndarray], statistic: Any) -> Cell:
     low = high = None
-    if any(len(stratum) > 1 for stratum in strata):  # else every draw is the same
+    if all(len(stratum) > 1 for stratum in strata):  # a single seed would seem to be certain
         low, high = map(float, bootstrap(statistic, strata))
     scores = tuple(float(s) for stratum in strata for s in stratum)
     return Cell(scores, float(statistic(strata)), low, high)
@@ -282,14 +283,14 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
     figure, panels = plt.subplots(
         height, columns, figsize=(3.1 * columns, 2.6 * height), squeeze=False, layout="constrained"
     )
-    for panel, ((_, task), methods) in zip(panels.flat, tasks.items(), strict=False):
+    for panel, ((suite, task), methods) in zip(panels.flat, tasks.items(), strict=False):
         shown = {key: cell for key, cell in methods.items() if not key[0].endswith("last")}
         for at, ((method, *_), cell) in enumerate(shown.items()):
-            colour = "#0072b2" if method == "wpt" else "#777777"
+            colour = COLOURS.get(method, "#777777")
             panel.plot(cell.scores, [at] * len(cell.scores), "o", ms=5, color=colour, alpha=0.7)
             panel.plot([cell.mean] * 2, [at - 0.3, at + 0.3], color=colour, lw=2)
-        panel.set_yticks(range(len(shown)), [method for method, *_ in shown], fontsize=7.5)
-        panel.set(xlim=(-4, 104), title=task)
+        panel.set_yticks(range(len(shown)), _names(shown), fontsize=7.5)
+        panel.set(xlim=(-4, 104), title=task.removeprefix(f"{suite}-"))
         panel.title.set_fontsize(9)
         panel.invert_yaxis()
         panel.grid(axis="x", lw=0.4)
@@ -300,3 +301,10 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     plt.close(figure)
+
+
+def _names(shown: Iterable[Key]) -> list[str]:
+    """Methods; where one stands more than once, with its frames."""
+    keys = list(shown)
+    times = Counter(method for method, *_ in keys)
+    return [m if times[m] == 1 else f"{m}, {frames:,} frames" for m, _, frames in keys]

@@ -162,7 +162,7 @@ def pre_trained(tmp_path):
     return tmp_path
 
 
-def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained, capsys):
+def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained):
     model, data = WPT.load(pre_trained / "model.zip"), TrajectoryDataset.open(pre_trained / "data")
     rows = list(prediction.judge(model, data, episodes=2))
     ways = ["world model", "copy last frame", "mean frame"]

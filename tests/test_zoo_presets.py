@@ -202,7 +202,7 @@ def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_pa
 
 @pytest.mark.parametrize(
     ("setting", "told"),
-    [("retrieval=nearst", "nearest"), ("guidance=foo", "Schedule 'foo'"), ("size=tny", "tiny")],
+    [("retrieval=nearst", "nearest"), ("guidance=foo", "guidance='foo'"), ("size=tny", "tiny")],
 )
 def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, told, tmp_path):
     with pytest.raises(ValueError, match=told):

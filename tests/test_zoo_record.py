@@ -137,9 +137,7 @@ def test_methods_are_told_from_doing_nothing_to_ours():
     told = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
     lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(told)]
     shown = sorted(lines, key=record._order)
-    assert [x.method for x in shown] == 2 * told and [x.task for x in shown] == 6 * ["a"] + 6 * [
-        "b"
-    ]
+    assert [(x.task, x.method) for x in shown] == [(task, m) for task in "ab" for m in told]
     assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]
 
 

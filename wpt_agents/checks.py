@@ -84,8 +84,8 @@ def check_spaces(env: VecEnv, max_action_dim: int) -> None:
         warnings.warn(f"Observations of {shape} are resized to {IMAGE_SHAPE}", stacklevel=3)
 
 
-def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
-    """Refuses a dataset that WPT cannot learn from."""
+def check_images(dataset: TrajectoryDataset) -> None:
+    """Refuses a dataset that shows WPT nothing, or images of another size."""
     if len(dataset) == 0:
         raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
     if dataset.image_size != IMAGE_SIZE:
@@ -93,6 +93,11 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
             f"The dataset {dataset.path} has images of {dataset.image_size} pixels, WPT takes "
             f"{IMAGE_SIZE}: resize them and store them anew"
         )
+
+
+def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
+    """Refuses a dataset that WPT cannot learn from."""
+    check_images(dataset)
     widest, longest = max(dataset.action_dims), max(dataset.lengths) + 1
     if widest > max_action_dim:
         raise ValueError(

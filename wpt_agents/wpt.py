@@ -349,7 +349,7 @@ class WPT(Pretraining, BaseAlgorithm):
         """// Experience Retrieval: the R trajectories that begin most like the task, Eq. (5)."""
         if self.dataset is None and self.retrieved_ids and self.offline_ratio:
             warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
-        wanted = self._guided() or self.offline_ratio
+        wanted = self._needs_clone() or self.offline_ratio
         if self.dataset is None and wanted and not self.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not wanted:
@@ -393,7 +393,7 @@ class WPT(Pretraining, BaseAlgorithm):
 
     def _clone(self, progress_bar: bool) -> None:
         """// Behavior Cloning Policy Training, on the retrieved trajectories."""
-        if self.retrieved is None or self.cloned or not self._guided():
+        if self.retrieved is None or self.cloned or not self._needs_clone():
             return
         policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
         optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
@@ -465,7 +465,7 @@ class WPT(Pretraining, BaseAlgorithm):
         spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
         return getattr(spec, "max_episode_steps", None) or 500
 
-    def _guided(self) -> bool:
+    def _needs_clone(self) -> bool:
         """Whether the prior actor will ever drive, or be imitated."""
         return ever(self.schedule) or ever(self.kickstart_schedule)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Generator
 
-from wpt_agents.checks import check_dataset
+from wpt_agents.checks import check_images
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Batch, Trajectory, led_to, stack_windows
 from wpt_agents.wpt import WPT
@@ -38,7 +38,7 @@ def judge(
     :param folder: where to draw
     :raises ValueError: no trajectory is long enough, or one has more actions than the model takes
     """
-    check_dataset(dataset, max([1, *dataset.action_dims]), batch_length=1)
+    check_images(dataset)
     if (widest := max(dataset.action_dims)) > model.max_action_dim:
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model takes at most "

@@ -18,6 +18,7 @@ import matplotlib
 import numpy as np
 
 from wpt_agents.archive import replacing
+from wpt_agents.zoo.plan import METHODS
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.tables import interval_text, markdown_table, number
@@ -58,7 +59,9 @@ class Line:
 
 
 COLOURS = {"wpt": "#0072b2", "kickstart": "#d55e00"}
-WPT_CLONES = "wpt", "kickstart", "no-rehearsal"  # methods whose prior actor is wpt's
+WPT_CLONES = [  # methods whose prior actor is wpt's, if they have one
+    name for name, m in METHODS.items() if m.pretrained and "retrieval" not in m.wpt
+]
 ORDER = (  # in which methods are told: the simplest first, then the paper's ablation, ours
     *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
     *("no-rehearsal", "random-retrieval", "no-pretrain", "wpt", "kickstart"),

@@ -570,6 +570,12 @@ def test_kickstarting_alone_has_a_clone_and_wants_windows_of_three_images(store)
         agent(DotEnv(), kickstart=1, batch_length=2)
 
 
+@pytest.mark.filterwarnings("ignore:No dataset")
+def test_kickstarting_without_a_clone_does_not_imitate_an_untrained_one():
+    model = agent(DotEnv(), kickstart=1).learn(2 * LENGTH)
+    assert not model.cloned and model._imitation(*replayed(model), defaultdict(list)) == 0
+
+
 def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):
     with pytest.warns(UserWarning, match=r"No dataset: .*model.prior .*dataset=.*guidance=0"):
         assert agent(DotEnv()).learn(LENGTH).prior is None

@@ -43,6 +43,9 @@ def test_the_share_of_the_nearest_that_are_of_ones_own_robot():
     assert (
         Retriever(places, np.ones(5, int), ["walker", None] * 2 + [None], "e").own_share() is None
     )
+    # those without a name, wherever they are, neither ask nor answer
+    more, labels = np.concatenate([[[0.1]], places, [[10.1]]]), [None, *names, None]
+    assert Retriever(more, np.ones(7, int), labels, "e").own_share(k=2) == one.own_share(k=2)
 
 
 def test_fewer_candidates_than_asked_for_are_all_returned_once():

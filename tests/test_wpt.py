@@ -193,6 +193,14 @@ def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
     assert model.learn(1).retrieved_ids == [2]
 
 
+def test_the_query_is_an_episodes_first_image_also_in_the_middle_of_one(store):
+    model = pretrained(store, num_retrieve=1, env=DotEnv(), offline_ratio=0, guidance=0)
+    model.env.seed(2)
+    model.learn(LENGTH // 2)  # retrieves nothing
+    model.offline_ratio = 0.5
+    assert model.learn(1, reset_num_timesteps=False).retrieved_ids == [2]
+
+
 def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
     def found(start, seed):
         model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
@@ -400,6 +408,58 @@ def test_an_interrupted_step_costs_the_open_episode_and_no_more():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
 
 
+def test_an_interrupted_update_costs_none_of_those_that_were_earned(monkeypatch):
+    def learn(model):
+        model.learn(4 * LENGTH, reset_num_timesteps=False)
+        return model
+
+    undisturbed, model = learn(agent(DotEnv(), train_ratio=4)), agent(DotEnv(), train_ratio=4)
+    update = model.update
+
+    def interrupted(metrics):
+        if model.updates == 5:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        update(metrics)
+
+    monkeypatch.setattr(model, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        learn(model)
+    model.learn(3 * LENGTH, reset_num_timesteps=False)
+    assert model.num_timesteps == 4 * LENGTH
+    assert (model.updates, model.credit) == (undisturbed.updates, undisturbed.credit)
+
+
+def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch):
+    undisturbed = pretrained(store, env=DotEnv(), bc_steps=3).learn(1)
+    model = pretrained(store, env=DotEnv(), bc_steps=3)
+    descend, steps = model._descend, []
+
+    def interrupted(*given):
+        steps.append(descend(*given))
+        if len(steps) == 2:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(model, "_descend", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(1)
+    assert not model.cloned
+    model.learn(1)
+    assert same(weights(model, "prior_actor"), weights(undisturbed, "prior_actor"))
+
+
+@pytest.mark.parametrize("name", ["learning_rate", "actor_critic_learning_rate"])
+def test_a_learning_rate_of_zero_teaches_nothing(name):
+    model = agent(DotEnv(), **{name: 0})
+    before = weights(model, "world_model", "actor", "critic")
+    after = weights(model.learn(2 * LENGTH), "world_model", "actor", "critic")
+    moved = {k.split(".")[0] for k in before if (before[k] != after[k]).any()}
+    assert moved == {"world_model", "actor", "critic"} - (
+        {"world_model"} if name == "learning_rate" else {"actor", "critic"}
+    )
+
+
 def test_a_given_episode_length_is_kept():
     model = agent(ClockEnv(), episode_length=5).learn(14)
     assert model.episode_length == model.hyperparameters["episode_length"] == 5
@@ -420,6 +480,20 @@ def test_another_width_drops_behaviour_and_replay_and_keeps_the_world_model(stor
     assert len(model.replay_buffer) == 0 and model.prior is None
     assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5]
     assert model.replay_buffer.trajectories[0].action_dim == 4
+
+
+def test_another_width_drops_what_was_retrieved_before_the_first_episode_ended(store):
+    model = pretrained(store, env=DotEnv()).learn(1)
+    assert model.cloned and model.episodes == 0
+    model.set_env(DotEnv(actions=4))
+    assert not model.cloned and sorted(model.learn(1).retrieved_ids) == [4, 5]
+
+
+def test_another_task_begins_with_an_episode_of_its_own():
+    model = agent(ClockEnv()).learn(4)
+    model.reset_task()
+    model.learn(3, reset_num_timesteps=False)
+    assert not model.replay_buffer.trajectories  # 4 + 3 steps would have ended the old one
 
 
 def test_one_pretrained_model_loads_onto_every_width(store, tmp_path):
@@ -470,6 +544,17 @@ def test_every_episode_is_judged_before_it_is_replayed(monkeypatch):
     )
     model.learn(21)
     assert seen == [0, 1, 2]
+
+
+def test_datasets_of_equal_shapes_are_told_apart_whatever_their_codec(tmp_path):
+    for codec in ("raw", "zstd"):
+        prints = set()
+        for i, seeds in enumerate([(0, 1), (0, 1), (0, 2)]):
+            folder = tmp_path / f"{codec}{i}"
+            with TrajectoryDataset.create(folder, codec=codec) as dataset:
+                dataset.extend(recorded(seed=seed) for seed in seeds)
+            prints.add(dataset.fingerprint)
+        assert len(prints) == 2
 
 
 def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path):

@@ -16,6 +16,7 @@ from run_folders import make_run
 from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
+from wpt_agents.actor_critic import lambda_return
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.diagnosis import promises
@@ -84,10 +85,11 @@ def test_promises_are_of_the_actions_and_rewards_from_the_start_on(monkeypatch):
     played = Trajectory(noise(7), action, reward)
     found = promises(policy, played, 0.5, [0, 4], 2)
     assert [(p.start, p.earned) for p in found] == [(0, 0.5), (4, 4.5)]
-    assert [p.discounted for p in found] == [
-        sum(r * 0.5**t for t, r in enumerate(reward)),
-        4 + 0.5 * 5,
-    ]
+    # what the critic is taught: image t came with reward t - 1, and the last one pays no more
+    arriving = torch.tensor([[0, *reward.tolist()]])
+    returns = lambda_return(arriving, torch.zeros(1, 8), 0.5, lam=1.0)[0]
+    assert [p.discounted for p in found] == pytest.approx([returns[0].item(), returns[4].item()])
+    assert found[1].discounted == 3 + 0.5 * 4 + 0.25 * 5
     np.testing.assert_array_equal(taken[0][0], action[:2])
     np.testing.assert_array_equal(taken[2][0], action[4:])  # taken[1] are the actor's own
     assert not np.array_equal(taken[1][0], action[:2])

@@ -47,10 +47,13 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
         if name in CHOICES and value not in CHOICES[name]:
             raise unknown_name(name, value, CHOICES[name])
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if name in COUNTS and not (number and value >= 1 and value == int(value)):
-            raise ValueError(f"{name} is a whole number from 1 on, got {value!r}")
+        least = 2 if name == "imagine_horizon" else 1  # the first state's value is no action's
+        if name in COUNTS and not (number and value >= least and value == int(value)):
+            raise ValueError(f"{name} is a whole number from {least} on, got {value!r}")
         if name in SHARES and not (number and 0 <= value <= 1):
             raise ValueError(f"{name} is a share in [0, 1], got {value!r}")
+        if name == "unimix" and value == 0:
+            raise ValueError("unimix=0 allows latents of probability 0, whose KL is infinite")
         if name in AMOUNTS and value is not None and not (number and 0 <= value < np.inf):
             raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 

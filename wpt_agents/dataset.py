@@ -277,7 +277,8 @@ class TrajectoryDataset(Conversions):
         """A hash of which trajectories these are, in which order; an index keeps its dataset's."""
         digest = hashlib.sha256()
         for e in self._entries:
-            digest.update(f"{e.shard} {e.at} {e.length} {e.blocks}\n".encode())
+            checksum = "" if e.checksum is None else f" {e.checksum}"
+            digest.update(f"{e.shard} {e.at} {e.length} {e.blocks}{checksum}\n".encode())
         return digest.hexdigest()
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> "TrajectoryDataset":

@@ -36,6 +36,7 @@ class Entry:
     """A trajectory's line in the index.
 
     :param blocks: the blocks' sizes in bytes, in words: parsing 60,000 lists would take a second
+    :param checksum: CRC-32 of the blocks' own; None in datasets written before it was there
     """
 
     shard: int
@@ -48,6 +49,7 @@ class Entry:
     embodiment: str | None = None
     task: str | None = None
     source: str | None = None
+    checksum: int | None = None
 
     @property
     def place(self) -> Place:

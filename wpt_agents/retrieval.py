@@ -151,17 +151,19 @@ class Retriever:
     def own_share(self, k: int = 10, queries: int = 100) -> float | None:
         """How well the features tell robots apart, without their names or widths to help.
 
-        :param queries: trajectories to ask for, evenly spread, all if there are fewer
-        :return: the share of their `k` nearest others that are of the same name; None where fewer
-            than two robots are named
+        :param queries: named trajectories to ask for, evenly spread, all if there are fewer
+        :return: the share of their `k` nearest named others that are of the same name; None where
+            fewer than two robots are named
         """
-        if len(set(self.embodiments) - {None}) < 2:
+        named = [i for i, name in enumerate(self.embodiments) if name is not None]
+        names = np.array(self.embodiments)[named]
+        if len(set(names)) < 2:
             return None
-        asked = np.unique(np.linspace(0, len(self) - 1, queries).round().astype(int))
+        others = Retriever(self.features[named], self.action_dims[named], [None] * len(named), "")
         same = []
-        for i in asked:
-            near = self.search(self.features[i], k + 1)[0]
-            same += [self.embodiments[j] == self.embodiments[i] for j in near[near != i][:k]]
+        for i in np.unique(np.linspace(0, len(named) - 1, queries).round().astype(int)):
+            near = others.search(others.features[i], k + 1)[0]
+            same += (names[near[near != i][:k]] == names[i]).tolist()
         return float(np.mean(same))
 
     def _candidates(self, embodiment: str | None, action_dim: int | None) -> np.ndarray:

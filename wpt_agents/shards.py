@@ -146,10 +146,18 @@ class Writer:
             self._shard, self._number, self._end = shard, self._number + 1, 0
         line_at = self._index.tell()
         try:
-            sizes = [_write(self._shard.fileno(), block) for block in blocks]
+            sizes, checksum = list[int](), 0
+            for block in blocks:
+                sizes.append(_write(self._shard.fileno(), block))
+                checksum = zlib.crc32(block[-4:], checksum)
             os.fsync(self._shard.fileno())
-            words = " ".join(map(str, sizes))
-            entry = replace(labels, shard=self._number, at=self._end, blocks=words)
+            entry = replace(
+                labels,
+                shard=self._number,
+                at=self._end,
+                blocks=" ".join(map(str, sizes)),
+                checksum=checksum,
+            )
             _write(self._index.fileno(), entry.line())
         except BaseException:
             for file, end in ((self._index, line_at), (self._shard, self._end)):

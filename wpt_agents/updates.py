@@ -67,7 +67,9 @@ class Updates:
 
     def _setup_optimizers(self) -> None:
         policy, model_rate = self.policy, float(self.learning_rate)
-        rate = self.actor_critic_learning_rate or SIZES[self.size].actor_critic_learning_rate
+        rate = self.actor_critic_learning_rate
+        if rate is None:
+            rate = SIZES[self.size].actor_critic_learning_rate
         model = policy.world_model
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self._optimizer(parts, model_rate)
@@ -76,7 +78,7 @@ class Updates:
 
     def _optimizer(self, parts: list[list[torch.nn.Parameter]], rate: float) -> Optimizer:
         """Adam over parts that are clipped each by itself."""
-        decay = self.weight_decay / rate  # AdamW multiplies it with the rate again
+        decay = self.weight_decay / rate if rate else 0.0  # AdamW multiplies it with the rate again
         groups = [{"params": part} for part in parts]
         return AdamW(groups, rate, eps=1e-5, weight_decay=decay, fused=True)
 

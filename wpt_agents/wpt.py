@@ -14,6 +14,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -195,7 +196,7 @@ class WPT(Pretraining, BaseAlgorithm):
         super().__init__(
             policy,
             None,
-            learning_rate=learning_rate or SIZES[size].learning_rate,
+            learning_rate=SIZES[size].learning_rate if learning_rate is None else learning_rate,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -287,7 +288,8 @@ class WPT(Pretraining, BaseAlgorithm):
         wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
         check_spaces(wrapped, self.max_action_dim)
         assert isinstance(wrapped.action_space, spaces.Box)
-        if self.episodes and wrapped.action_space.shape != self.action_space.shape:
+        begun = self.episodes or self.retrieved_ids
+        if begun and wrapped.action_space.shape != self.action_space.shape:
             self.reset_task()
         self.env, self.n_envs = wrapped, wrapped.num_envs
         self._vec_normalize_env = unwrap_vec_normalize(wrapped)
@@ -304,6 +306,7 @@ class WPT(Pretraining, BaseAlgorithm):
         """Forgets the task and keeps the world model: replay, rewards, behaviour, retrieval."""
         self.replay_buffer, self.retrieved, self.retrieved_ids = ReplayBuffer(), None, []
         self.cloned, self.credit, self._seen_length = False, 0.0, None
+        self._rollout = self._last_obs = None
         self.policy.reset_behavior()
         self._setup_optimizers()
 
@@ -355,12 +358,19 @@ class WPT(Pretraining, BaseAlgorithm):
         if self.dataset is None or self.retrieved is not None or not wanted:
             return
         if not self.retrieved_ids or self.retrieved_of != self.dataset.fingerprint:
-            query = self.policy.embed(to_images(self._last_obs)[0][:1])[0]
+            query = self.policy.embed(self._first_image())[0]
             self.retrieved_ids = self._search(query, progress_bar)
             self.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
         for trajectory in self.dataset.subset(self.retrieved_ids):
             self.retrieved.add(replace(trajectory, reward=None))
+
+    def _first_image(self) -> np.ndarray:
+        """(1, 64, 64, 3), the first image of the first environment's open episode."""
+        frame = to_images(self._last_obs)[0][0]
+        if self._rollout is not None and not self._last_episode_starts.all():
+            frame = [*self._rollout.images[0], frame][0]
+        return frame[None]
 
     def _search(self, query: np.ndarray, progress_bar: bool) -> list[int]:
         assert self.dataset is not None
@@ -396,14 +406,16 @@ class WPT(Pretraining, BaseAlgorithm):
         if self.retrieved is None or self.cloned or not self._needs_clone():
             return
         policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
-        optimizer = AdamW(policy.prior_actor.parameters(), self.bc_learning_rate, weight_decay=0)
+        clone = deepcopy(policy.prior_actor)  # so that an interruption leaves nothing half-learnt
+        optimizer = AdamW(clone.parameters(), self.bc_learning_rate, weight_decay=0)
         for step in tqdm(range(self.bc_steps), desc="clone", disable=not progress_bar):
             pairs = draw_pairs(shown, self.bc_batch_size, width, self._stream(CLONE, step))
             image, action = (tensor.to(self.device) for tensor in pairs)
             with self._autocast():
                 image = random_shift(image, generator=self._generator(CLONE, step))
-                loss = bc_loss(policy.prior_actor(image), action, policy.action_mask)
+                loss = bc_loss(clone(image), action, policy.action_mask)
             self._descend(optimizer, loss, "bc")
+        policy.prior_actor.load_state_dict(clone.state_dict())
         self.cloned = True
 
     # ------------------------------------------------------------------------- // Collect Data
@@ -482,10 +494,12 @@ class WPT(Pretraining, BaseAlgorithm):
             return
         per_update = self.batch_size * self.batch_length
         updates = int(self.credit * self.train_ratio / per_update)
-        self.credit -= updates * per_update / self.train_ratio
+        price = per_update / self.train_ratio
+        rest = self.credit - updates * price
         metrics: dict[str, list[Tensor]] = defaultdict(list)
-        for _ in range(updates):
+        for left in reversed(range(updates)):
             self.update(metrics)
+            self.credit = rest + left * price  # so that an interruption costs no updates
         for key, values in metrics.items():
             self.logger.record_mean(key, torch.stack(values).mean().item())
 

@@ -38,7 +38,8 @@ class Promise:
     :param same_actions: what the model expects of the actions that were taken
     :param own_actions: what it expects of the actor
     :param value: the critic's
-    :param discounted: the discounted return to the episode's end
+    :param discounted: what that stands for, Eq. (2)'s return to the episode's end: of arriving in
+        the state, and discounted of all that follows
     """
 
     start: float
@@ -72,7 +73,7 @@ def promises(
         same_actions, own_actions = (
             float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, own)
         )
-        rest = trajectory.reward[start:]
+        arriving, rest = float(batch.reward[0, start]), trajectory.reward[start:]
         found.append(
             Promise(
                 start,
@@ -80,7 +81,7 @@ def promises(
                 same_actions,
                 own_actions,
                 float(value[start]),
-                float(rest @ gamma ** np.arange(len(rest))),
+                arriving + float(rest @ gamma ** np.arange(1, len(rest) + 1)),
             )
         )
     return found

@@ -1,8 +1,8 @@
-# Two commands on a bare machine (Python 3.11+, git, a shell):
+# Three commands on a bare machine (Python 3.11+, git, a shell):
 #   make demo    installs, then runs the whole method on one task in minutes
 #   make test    installs, then runs the tests
 #   make learn   the test that learns from scratch, three seeds of some minutes each
-# Both make .venv when it is not there. Nothing outside this folder is written.
+# They make .venv when it is not there. Nothing outside this folder is written.
 
 PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13,$(if $(shell $(p) -c "import sys; print(sys.version_info >= (3, 11) or '')" 2>/dev/null),$(p))))
 VENV := .venv

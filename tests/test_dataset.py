@@ -122,11 +122,11 @@ def test_trajectories_shorter_than_a_window_are_chained_not_dropped(tmp_path):
     assert joints.any()
 
 
-def test_batch_k_depends_on_seed_rank_and_k_alone(tmp_path):
+def test_batch_k_depends_on_seed_purpose_and_k_alone(tmp_path):
     dataset = made(tmp_path, chain(300))
 
-    def starts(rank, start):
-        batches = dataset.batches(4, 9, 2, seed=1, rank=rank, start=start)
+    def starts(purpose, start):
+        batches = dataset.batches(4, 9, 2, seed=1, purpose=purpose, start=start)
         found = [next(batches).image[:, 0, 0, 0, 0].tolist() for _ in range(5)]
         batches.close()
         return found

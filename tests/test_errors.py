@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents import pretraining, updates, wpt
+from wpt_agents import checks, pretraining, updates, wpt
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.trajectory import Trajectory
 from wpt_agents.wpt import WPT
@@ -279,6 +279,12 @@ def test_the_debug_settings_are_all_keywords_of_the_constructor():
         ("batch_size", 0, "batch_size is a whole number from 1 on, got 0"),
         ("imagine_horizon", 2.5, "imagine_horizon is a whole number from 2 on"),
         ("imagine_horizon", 1, "imagine_horizon is a whole number from 2 on, got 1"),
+        ("batch_size", 16.0, "batch_size is a whole number from 1 on, got 16.0"),
+        ("batch_size", float("inf"), "batch_size is a whole number from 1 on, got inf"),
+        ("num_retrieve", True, "num_retrieve is a whole number from 1 on, got True"),
+        ("episode_length", -5, "episode_length is a whole number from 1 on, got -5"),
+        ("return_norm", "no", "return_norm is True or False, got 'no'"),
+        ("size", 3, "No size 3"),
         ("unimix", 0, "unimix=0 allows latents of probability 0"),
         ("train_ratio", -1, "train_ratio is a number from 0 on, got -1"),
         ("learning_rate", float("nan"), "learning_rate is a number from 0 on"),
@@ -287,6 +293,24 @@ def test_the_debug_settings_are_all_keywords_of_the_constructor():
 def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
     with pytest.raises(ValueError, match=message):
         agent(**{name: value})
+
+
+def test_every_keyword_that_is_no_schedule_is_checked():
+    lists = checks.COUNTS, checks.OPTIONAL_COUNTS, checks.SWITCHES, checks.SHARES, checks.AMOUNTS
+    checked = {name for names in [*lists, checks.CHOICES] for name in names}
+    assert wpt.HYPERPARAMETERS - checked == {"guidance", "kickstart", "embodiment", "seed"}
+
+
+def test_what_open_loop_cannot_show_is_refused_by_name():
+    model, seen = agent(), recorded(actions=2)
+    with pytest.raises(ValueError, match=r"context counts .* got 0"):
+        model.open_loop(seen, context=0)
+    with pytest.raises(ValueError, match=r"6 actions.*max_action_dim=4"):
+        model.open_loop(Trajectory(seen.image, np.zeros((8, 6), np.float32)))
+    with pytest.raises(ValueError, match=r"\(32, 32, 3\)"):
+        model.open_loop(Trajectory(seen.image[:, ::2, ::2], seen.action))
+    with pytest.raises(ValueError, match="No dataset to index"):
+        model.build_index()
 
 
 def test_a_plan_with_such_a_value_is_refused_before_anything_is_made(tmp_path):

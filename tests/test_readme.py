@@ -2,7 +2,7 @@
 
 import inspect
 import re
-import sys
+import shlex
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
@@ -11,13 +11,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env
+import typer
 from debug_agent import SETTINGS, agent
 from stable_baselines3.common.logger import Logger
+from typer.core import TyperGroup
+from typer.main import get_command
 from wpt_envs import dmc
 from wpt_envs.tasks import TASKS
 
 from wpt_agents.zoo import __main__ as command_line
-from wpt_agents.zoo.presets import load_preset
+from wpt_agents.zoo.collect import BEHAVIOURS
+from wpt_agents.zoo.plan import METHODS
+from wpt_agents.zoo.presets import load_preset, suite_names
+from wpt_agents.zoo.tasks import find_tasks
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -44,7 +50,12 @@ def section(title):
 
 EXAMPLE = blocks(section("The whole method in a script"))[0]
 LISTED = section("The zoo: data, runs and tables from the command line")
-COMMANDS = re.findall(r"^python -m wpt_agents\.zoo (.*)$", LISTED, re.M)
+COMMANDS = {
+    command.replace("\\\n", " ")
+    for text in [README, *PAGES.values()]
+    for block in blocks(text, "bash")
+    for command in re.findall(r"^python -m wpt_agents\.zoo ((?:.*\\\n)*[^#\n]*)", block, re.M)
+}
 NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name"))
 
 
@@ -95,18 +106,20 @@ def test_the_table_of_the_paper_names_what_exists():
         assert callable(resolve_name(f"wpt_agents.{name}")), name
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_of_the_readme_is_understood(command, monkeypatch, capsys):
-    words = command.replace("'", "").split()
-    name = words[:2] if words[0] in ("data", "retrieve") else words[:1]
-    monkeypatch.setattr(sys, "argv", ["zoo", *name, "--help"])
-    with pytest.raises(SystemExit):
-        command_line.main()
-    told = capsys.readouterr().out
-    assert all(word in told for word in words if word.startswith("--")), told
-    if words[0] == "run":
-        suite = words[words.index("--suite") + 1] if "--suite" in words else "dmc"
-        load_preset(suite, words[words.index("--preset") + 1])
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_of_readme_and_docs_is_understood(command):
+    words = shlex.split(re.sub(r"\$\([^)]*\)", "FILE", command))
+    parser = get_command(command_line.app)
+    while isinstance(parser, TyperGroup):
+        _, parser, words = parser.resolve_command(typer.Context(parser), words)
+    given = parser.make_context("zoo", words).params
+    tasks = [task for task in given.get("tasks") or [] if "$" not in task]
+    suite = given.get("suite") or "dmc"
+    find_tasks(suite, tasks)
+    if given.get("preset") and suite in suite_names():
+        load_preset(suite, given["preset"], given.get("settings") or [])
+    assert set(given.get("method") or []) <= set(METHODS)
+    assert (given.get("behaviour") or "noise") in BEHAVIOURS
 
 
 def test_every_task_and_keyword_that_is_named_exists():

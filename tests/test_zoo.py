@@ -16,11 +16,13 @@ from run_folders import make_run
 from scipy import stats
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from typer.main import get_command
 from wpt_envs.tasks import TASKS, Task
 from zoo_command import call
 
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.wpt import WPT
+from wpt_agents.zoo import __main__ as command_line
 from wpt_agents.zoo import benchmark, stages
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.evaluation import DoNothing, RandomPolicy, evaluate, make_vec_env
@@ -170,6 +172,16 @@ def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
     run(one)
     assert one.config()["data"] == str(own)
     assert not list((tmp_path / "cache").glob("data-*"))
+    path = one.shared.model_path
+    assert job(tmp_path, data=own.rename(tmp_path / "moved")).shared.model_path == path
+
+
+def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):
+    own = job(tmp_path).shared.data().path
+    job(tmp_path, data=own).shared.data()
+    assert "warning" not in capsys.readouterr().out
+    job(tmp_path, data=own, env={"rendering": "near"}).shared.data()
+    assert "data of rendering=fast, but the task has rendering=near" in capsys.readouterr().out
 
 
 def test_half_a_pretraining_is_continued(tmp_path, monkeypatch):
@@ -381,7 +393,7 @@ def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-COMMANDS = ("list", "collect", "pretrain", "run", "eval", "enjoy", "push", "pull", "report")
+COMMANDS = get_command(command_line.app).commands
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])

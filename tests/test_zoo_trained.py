@@ -141,7 +141,7 @@ def test_the_card_tells_scores_command_and_how_to_load(tmp_path):
     (result,) = about["model-index"][0]["results"]
     assert result["metrics"][0]["value"] == 710.0
     assert about["library_name"] == "wpt-agents"
-    for text in ("| WPT | 710 |", "seed 3", "run --tasks dmc-walker-run", "zoo pull me/walker"):
+    for text in ("| WPT | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
         assert text in told
 
 
@@ -149,7 +149,11 @@ def test_what_was_pushed_is_pulled_the_same(tmp_path, hub):  # noqa: F811
     folder = make_run(tmp_path, "dmc-walker-run")
     (folder / "model.zip").write_bytes(b"weights" * 1000)
     (folder / "checkpoints").mkdir()
+    config = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config + f"data: {tmp_path}\n")
     address = push(folder, "me/walker")
+    assert not any(str(tmp_path).encode() in told for told in hub.files["me/walker"].values())
+    (folder / "config.yaml").write_text(config)
     assert address.endswith("me/walker")
     assert {"README.md", "replay.mp4", "model.zip", "result.json"} <= hub.files["me/walker"].keys()
     assert b"model-index" in hub.files["me/walker"]["README.md"]

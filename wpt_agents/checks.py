@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Collection, Mapping
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.names import unknown_name
 from wpt_agents.networks import SIZES
-from wpt_agents.trajectory import IMAGE_SIZE
+from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
 
 IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
 
@@ -20,6 +21,8 @@ COUNTS = (  # keywords of WPT that count something there must be one of
     *("max_action_dim", "batch_size", "batch_length", "imagine_horizon"),
     *("num_retrieve", "bc_steps", "bc_batch_size"),
 )
+OPTIONAL_COUNTS = ("episode_length",)
+SWITCHES = "return_norm", "zero_init_heads", "compile"
 SHARES = ("gamma", "lam", "target_fraction", "unimix", "offline_ratio")
 AMOUNTS = (  # and those that may be 0 but not less
     *("learning_rate", "actor_critic_learning_rate", "bc_learning_rate", "weight_decay"),
@@ -44,12 +47,15 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
         else that is no number from 0 on, an unknown choice
     """
     for name, value in given.items():
-        if name in CHOICES and value not in CHOICES[name]:
+        if name in CHOICES and value not in tuple(CHOICES[name]):
             raise unknown_name(name, value, CHOICES[name])
-        number = isinstance(value, int | float) and not isinstance(value, bool)
+        number = isinstance(value, Real) and not isinstance(value, bool)
         least = 2 if name == "imagine_horizon" else 1  # the first state's value is no action's
-        if name in COUNTS and not (number and value >= least and value == int(value)):
+        whole = number and isinstance(value, Integral) and int(value) >= least
+        if not whole and (name in COUNTS or (name in OPTIONAL_COUNTS and value is not None)):
             raise ValueError(f"{name} is a whole number from {least} on, got {value!r}")
+        if name in SWITCHES and not (value is None or isinstance(value, bool)):
+            raise ValueError(f"{name} is True or False, got {value!r}")
         if name in SHARES and not (number and 0 <= value <= 1):
             raise ValueError(f"{name} is a share in [0, 1], got {value!r}")
         if name == "unimix" and value == 0:
@@ -111,6 +117,17 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
         raise ValueError(
             f"The longest trajectory of {dataset.path} has {longest} images, a batch window "
             f"takes {batch_length}: give batch_length={longest} or less"
+        )
+
+
+def check_trajectory(trajectory: Trajectory, max_action_dim: int) -> None:
+    """Refuses a trajectory that a model cannot look at."""
+    if trajectory.image.shape[1:] != IMAGE_SHAPE:
+        raise ValueError(f"The trajectory's images are {trajectory.image.shape[1:]}: resize to 64")
+    if trajectory.action_dim > max_action_dim:
+        raise ValueError(
+            f"The trajectory has {trajectory.action_dim} actions, the model takes at most "
+            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
         )
 
 

@@ -327,22 +327,22 @@ class TrajectoryDataset(Conversions):
         length: int,
         action_width: int,
         seed: int,
-        rank: int = 0,
+        purpose: int = 0,
         start: int = 0,
         ahead: int = 2,
         pin: bool = False,
         share: slice = slice(None),
     ) -> Generator[Batch, None, None]:
-        """Batches without end, from number `start`; batch k depends on (seed, rank, k) alone.
+        """Batches without end, from number `start`; batch k depends on (seed, purpose, k) alone.
 
-        :param rank: another for each purpose that shares the seed
+        :param purpose: another number for each use that shares the seed
         :param ahead: how many are prepared in the background
         :param pin: put them into pinned memory, from which a GPU copies while it computes
         :param share: which of each batch's rows are read, for one of several processes
         """
 
         def draw(k: int) -> Batch:
-            rng = np.random.default_rng([seed, rank, k])
+            rng = np.random.default_rng([seed, purpose, k])
             batch = self.sample(batch_size, length, action_width, rng, share)
             return batch.pin() if pin else batch
 

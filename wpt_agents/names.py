@@ -4,10 +4,10 @@ import difflib
 from collections.abc import Iterable
 
 
-def unknown_name(kind: str, name: str, valid: Iterable[str]) -> ValueError:
+def unknown_name(kind: str, name: object, valid: Iterable[str]) -> ValueError:
     """The error to raise for an unknown name: what came, and what would do."""
     names = sorted(valid)
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     return ValueError(f"No {kind} {name!r}. {hint}There are: {', '.join(names)}")
 

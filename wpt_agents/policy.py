@@ -265,7 +265,8 @@ class WPTPolicy(BasePolicy):
         """
         stop = min(context + horizon, len(trajectory) + 1)
         batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)])
-        frames = self.world_model.open_loop(batch.to(self.device), context)
+        generator = Generator(self.device).manual_seed(0)
+        frames = self.world_model.open_loop(batch.to(self.device), context, generator)
         return frames[0].cpu().numpy()
 
     @torch.no_grad()
@@ -302,7 +303,7 @@ class PriorPolicy:
         observation: np.ndarray | dict[str, np.ndarray],
         state: State | None = None,
         episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
         """As `WPTPolicy.predict`; the clone has no noise to leave out."""
         images, batched = to_images(observation)

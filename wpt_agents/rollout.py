@@ -36,7 +36,6 @@ class Rollout:
         self.images: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
         self.actions: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
         self.rewards: list[list[float]] = [[] for _ in range(n_envs)]
-        self.guided_steps = 0
 
     def act(self, image: np.ndarray, guide: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """One action per environment; the latent is filtered whoever drives.
@@ -56,7 +55,6 @@ class Rollout:
         guided = (start <= time) & (time < stop)
         if guided.any():
             action[guided] = guide(self.frames[guided])
-        self.guided_steps += int(guided.sum())
         self.state = (state[0], state[1], action)
         for i, (frame, each) in enumerate(zip(image, action, strict=True)):
             self.images[i].append(frame.copy())

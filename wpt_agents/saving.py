@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import get_system_info
 from torch import Tensor
 
 from wpt_agents.dataset import TrajectoryDataset
@@ -93,6 +94,7 @@ class Saving:
         :param path: as given to `save`
         :param env: the environment to go on with
         :param custom_objects: accepted for SB3's sake
+        :param print_system_info: print this system's versions, as SB3 does
         :param kwargs: keywords of `WPT` to change; `dataset=` for rehearsal and guidance
         :raises ValueError: a file that is cut short, damaged or not ours; an unknown keyword
         :raises FileNotFoundError: there is none; in a folder, says which ones it holds
@@ -100,6 +102,8 @@ class Saving:
         if isinstance(path, str | os.PathLike):
             path = _model_file(Path(path))
         cls._check_keywords(kwargs)
+        if print_system_info:
+            get_system_info()
         about, tensors = read_model(path)
         model: Self = cls(device=device, **{**about["hyperparameters"], **kwargs})
         low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))

@@ -84,7 +84,6 @@ class Updates:
 
     def update(self, metrics: dict[str, list[Tensor]]) -> None:
         """One gradient step of every network on a mixed batch; appends to `metrics`."""
-        generator = self._generator(UPDATE, self.updates)
         batch = mix(
             self.replay_buffer,
             self.retrieved,
@@ -94,10 +93,15 @@ class Updates:
             self.max_action_dim,
             self._stream(UPDATE, self.updates),
         ).to(self.device)
+        self._update_on(batch, metrics)
+        self.updates += 1
+
+    def _update_on(self, batch: Batch, metrics: dict[str, list[Tensor]]) -> None:
+        """World model and reward head on the batch; actor and critic on dreams from its states."""
+        generator = self._generator(UPDATE, self.updates)
         post = self._update_world_model(batch, metrics, generator, learn_reward=True)
         imitation = self._imitation(post, batch, metrics)
         self._update_behavior(post.flatten_time(), metrics, generator, imitation)
-        self.updates += 1
 
     def _update_world_model(
         self,

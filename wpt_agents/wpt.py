@@ -31,7 +31,13 @@ from torch.optim import AdamW
 from tqdm.auto import tqdm
 
 from wpt_agents.behavior_cloning import FRAMES, bc_loss, draw_pairs, random_shift
-from wpt_agents.checks import check_dataset, check_hyperparameters, check_rewards, check_spaces
+from wpt_agents.checks import (
+    check_dataset,
+    check_hyperparameters,
+    check_rewards,
+    check_spaces,
+    check_trajectory,
+)
 from wpt_agents.compiled import compile_loops
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import draw_window, ever, parse_schedule
@@ -303,7 +309,10 @@ class WPT(Pretraining, BaseAlgorithm):
             wrapped.seed(self.seed)
 
     def reset_task(self) -> None:
-        """Forgets the task and keeps the world model: replay, rewards, behaviour, retrieval."""
+        """Forgets the task and keeps the world model: replay, rewards, behaviour, retrieval go.
+
+        Optimisers, the world model's too, start anew.
+        """
         self.replay_buffer, self.retrieved, self.retrieved_ids = ReplayBuffer(), None, []
         self.cloned, self.credit, self._seen_length = False, 0.0, None
         self._rollout = self._last_obs = None
@@ -397,7 +406,8 @@ class WPT(Pretraining, BaseAlgorithm):
 
     def build_index(self, progress_bar: bool = False) -> Retriever:
         """The index over the dataset's first images by this encoder, kept beside the dataset."""
-        assert self.dataset is not None
+        if self.dataset is None:
+            raise ValueError("No dataset to index: give dataset= to load or WPT")
         policy = self.policy
         return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
 
@@ -511,7 +521,13 @@ class WPT(Pretraining, BaseAlgorithm):
         return PriorPolicy(self.policy) if self.cloned else None
 
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """What the world model expects to see: (T, 64, 64, 3) uint8, `context` of them filtered."""
+        """What the world model expects to see: (T, 64, 64, 3) uint8, `context` of them filtered.
+
+        :raises ValueError: no context, more actions than the model takes, images of another size
+        """
+        if context < 1:
+            raise ValueError(f"context counts the images that are seen, at least 1, got {context}")
+        check_trajectory(trajectory, self.max_action_dim)
         return self.policy.open_loop(trajectory, context, horizon)
 
     # ------------------------------------------------------------------------------- logging

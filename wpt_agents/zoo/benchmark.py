@@ -329,15 +329,17 @@ def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) ->
 
 def commit() -> str | None:
     """The checkout's commit, '+' behind it when files differ; None outside a checkout."""
-    here = Path(__file__).parent
-    told = subprocess.run(
+    root = Path(__file__).parents[2]
+    if shutil.which("git") is None or not (root / ".git").exists():
+        return None
+    answer = subprocess.run(
         ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
-        cwd=here,
+        cwd=root,
         capture_output=True,
         text=True,
         check=False,
     )
-    return told.stdout.strip() or None
+    return answer.stdout.strip() or None
 
 
 def system() -> dict[str, Any]:

@@ -10,13 +10,13 @@ from typing import Any
 import yaml
 
 from wpt_agents.zoo.machine import import_extra
-from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report import record, tables
 from wpt_agents.zoo.report.aggregates import score_of
 from wpt_agents.zoo.trained import find_trained
 
 # What is shared; logs, replay and checkpoints stay at home.
 FILES = (
-    *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json", "command.txt"),
+    *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json"),
     *("evaluations.npz", "0.monitor.csv", "policy.mp4", "learning_curve.png", "predictions.png"),
     "retrieval.png",
 )
@@ -38,6 +38,9 @@ def push(folder: Path, name: str, private: bool = False) -> str:
         for file in FILES:
             if (folder / file).exists():
                 shutil.copy2(folder / file, Path(aside) / file)
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config.pop("data", None)  # a path on this machine
+        (Path(aside) / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         if (folder / "policy.mp4").exists():
             shutil.copy2(folder / "policy.mp4", Path(aside) / VIDEO)
         (Path(aside) / "README.md").write_text(card(folder, name))
@@ -90,7 +93,7 @@ def card(folder: Path, name: str) -> str:
         table=tables.markdown_table(
             tables.POLICY_HEADINGS, map(tables.policy_cells, tables.policies([result]))
         ),
-        command=(folder / "command.txt").read_text().strip(),
+        command=record.command(result),
         name=name,
         folder=name.split("/")[1],
         **{key: result[key] for key in ("task", "method", "preset", "seed", "frames", "commit")},

@@ -201,18 +201,19 @@ def check_width(job: Run, widths: Collection[int]) -> None:
     :param widths: of the actions in the data
     """
     needed, wpt, method = job.task.action_dim, wpt_keywords() | job.wpt, METHODS[job.method]
+    if job.retrieves and needed not in widths:
+        raise ValueError(
+            f"{short_name(job.task)} has {needed} actions, and nothing in the data has as many "
+            f"({', '.join(map(str, sorted(widths)))}): name other --tasks, add such a task to "
+            "collect.tasks (--set), give --data that hold it, or use --method scratch or "
+            "pretrain-only"
+        )
     widest = max(needed, *widths) if method.needs_data else needed
     if widest > wpt["max_action_dim"]:
         whose = f"{short_name(job.task)} has" if needed == widest else "The data have"
         raise ValueError(
             f"{whose} {widest} actions, the preset's max_action_dim is "
             f"{wpt['max_action_dim']}: --set max_action_dim={widest}"
-        )
-    if job.retrieves and needed not in widths:
-        raise ValueError(
-            f"{short_name(job.task)} has {needed} actions, and nothing in the data has as many "
-            f"({', '.join(map(str, sorted(widths)))}): add such a task to collect.tasks (--set), "
-            "give --data that hold it, or use --method scratch or pretrain-only"
         )
 
 

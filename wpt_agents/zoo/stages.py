@@ -134,10 +134,10 @@ class Shared:
 
     @property
     def data_source(self) -> str:
-        """What the data are, however far `cache` is moved."""
+        """What the data are, wherever they lie."""
         if self.given_data is None:
             return self.data_path.name
-        return f"{self.data_path} {TrajectoryDataset.open(self.data_path).fingerprint}"
+        return TrajectoryDataset.open(self.data_path).fingerprint
 
     @property
     def pretraining(self) -> dict[str, Any]:
@@ -149,6 +149,7 @@ class Shared:
         if self.given_data is not None:
             dataset = TrajectoryDataset.open(self.given_data)
             say("collect", f"given, {counted(len(dataset), 'episode')}  [dim]{self.data_path}")
+            self._say_what_differs()
             return dataset
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
@@ -169,6 +170,14 @@ class Shared:
             given.behaviour,
             self.env,
         )
+
+    def _say_what_differs(self) -> None:
+        """Warns of given data that `collect` recorded in another environment than the task's."""
+        label = self.data_path / "collect.json"
+        recorded = json.loads(label.read_text())["env"] if label.exists() else {}
+        for name, value in recorded.items():
+            if self.env.get(name, value) != value:
+                say("warning", f"data of {name}={value}, but the task has {name}={self.env[name]}")
 
     def model(self, dataset: TrajectoryDataset) -> Path:
         """Stage 2: the file of the pre-trained model; half a pre-training is continued."""

@@ -133,11 +133,4 @@ def world_model_step(model: WPT, batch: Batch, learn_reward: bool = False) -> Ca
 
 def whole_step(model: WPT, batch: Batch) -> Callable[[], Any]:
     """`WPT.update` on `batch`: world model, reward, imagination, actor and critic."""
-
-    def step() -> None:
-        metrics: dict[str, list[Tensor]] = defaultdict(list)
-        generator = model._generator(UPDATE, 0)
-        post = model._update_world_model(batch, metrics, generator, learn_reward=True)
-        model._update_behavior(post.flatten_time(), metrics, generator)
-
-    return step
+    return lambda: model._update_on(batch, defaultdict(list))

@@ -68,8 +68,8 @@ def svg(figure: Figure, title: str) -> str:
 _LABEL = 'role="img" aria-label="ARIA" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
-def _axes(width: float = 3.6, height: float = 2.5) -> tuple[Figure, Axes]:
-    figure = plt.figure(figsize=(width, height), layout="constrained")
+def _axes() -> tuple[Figure, Axes]:
+    figure = plt.figure(figsize=(3.6, 2.5), layout="constrained")
     return figure, figure.add_subplot()
 
 
@@ -84,13 +84,11 @@ def lines(
     y_label: str,
     given: Sequence[Line],
     labels: Sequence[str],
-    marks: Mapping[str, float] | None = None,
     step: bool = False,
 ) -> str:
     """Lines with their bands.
 
     :param labels: all series of the page, for their colours
-    :param marks: horizontal lines by name
     :param step: draw stairs, as for a distribution
     """
     with matplotlib.rc_context(STYLE):
@@ -103,17 +101,6 @@ def lines(
             axes.plot(line.x, middle, color=colour, lw=1.8, marker=marker, ms=3, drawstyle=how)
             axes.fill_between(
                 line.x, low, high, color=colour, alpha=0.18, lw=0, step="post" if step else None
-            )
-        for name, value in (marks or {}).items():
-            axes.axhline(value, color=MUTED, ls=(0, (4, 3)), lw=1)
-            axes.annotate(
-                name,
-                (0.99, value),
-                xycoords=("axes fraction", "data"),
-                ha="right",
-                va="bottom",
-                fontsize=7.5,
-                color=MUTED,
             )
         axes.set(title=title, xlabel=x_label, ylabel=y_label)
         axes.xaxis.set_major_locator(plt.MaxNLocator(5))

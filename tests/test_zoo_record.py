@@ -124,12 +124,13 @@ def test_three_suites_have_no_mean_of_both():
     assert set(record.by_suite(lines)["wpt"]) == {"dmc", "mw", "robotics"}
 
 
-def test_the_pages_table_is_the_records():
+def test_the_pages_rows_are_the_records():
     root = Path(__file__).parents[1]
-    lines = record.read(root / "zoo" / "results" / "small-benchmark.csv")
-    told = record.markdown(lines)
-    assert told in (root / "docs" / "small-benchmark.md").read_text()
+    told = record.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
     assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()
+    page = (root / "docs" / "small-benchmark.md").read_text().splitlines()
+    rows = [line for line in page if line.startswith(("| dmc |", "| metaworld |", "| both |"))]
+    assert len(rows) > 10 and set(rows) <= set(told.splitlines())
 
 
 def test_methods_are_told_from_doing_nothing_to_ours():

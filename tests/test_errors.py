@@ -1,5 +1,7 @@
 """Bad input: each error names the culprit and the remedy, and nothing is lost."""
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -283,6 +285,7 @@ def test_the_debug_settings_are_all_keywords_of_the_constructor():
         ("batch_size", float("inf"), "batch_size is a whole number from 1 on, got inf"),
         ("num_retrieve", True, "num_retrieve is a whole number from 1 on, got True"),
         ("episode_length", -5, "episode_length is a whole number from 1 on, got -5"),
+        ("train_ratio", None, "train_ratio is a number from 0 on, got None"),
         ("return_norm", "no", "return_norm is True or False, got 'no'"),
         ("size", 3, "No size 3"),
         ("unimix", 0, "unimix=0 allows latents of probability 0"),
@@ -296,9 +299,12 @@ def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
 
 
 def test_every_keyword_that_is_no_schedule_is_checked():
-    lists = checks.COUNTS, checks.OPTIONAL_COUNTS, checks.SWITCHES, checks.SHARES, checks.AMOUNTS
+    lists = checks.COUNTS, checks.SWITCHES, checks.SHARES, checks.AMOUNTS
     checked = {name for names in [*lists, checks.CHOICES] for name in names}
     assert wpt.HYPERPARAMETERS - checked == {"guidance", "kickstart", "embodiment", "seed"}
+    keywords = inspect.signature(WPT.__init__).parameters
+    none = {name for name in wpt.HYPERPARAMETERS if keywords[name].default is None}
+    assert none == set(checks.OPTIONAL)
 
 
 def test_what_open_loop_cannot_show_is_refused_by_name():

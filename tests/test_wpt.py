@@ -505,10 +505,11 @@ def test_one_pretrained_model_loads_onto_every_width(store, tmp_path):
 
 def test_open_loop_shows_the_context_and_then_a_dream(store):
     trajectory = recorded(length=12)
-    frames = pretrained(store).open_loop(trajectory, context=4, horizon=6)
+    model = pretrained(store)
+    frames = model.open_loop(trajectory, context=4, horizon=6)
     assert frames.shape == (10, 64, 64, 3) and frames.dtype == np.uint8
-    assert (frames == pretrained(store).open_loop(trajectory, context=4, horizon=6)).all()
-    short = pretrained(store).open_loop(Trajectory(trajectory.image[:8], trajectory.action[:7]))
+    assert (frames == model.open_loop(trajectory, context=4, horizon=6)).all()
+    short = model.open_loop(Trajectory(trajectory.image[:8], trajectory.action[:7]))
     assert len(short) == 8
 
 

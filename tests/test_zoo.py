@@ -176,6 +176,12 @@ def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
     assert job(tmp_path, data=own.rename(tmp_path / "moved")).shared.model_path == path
 
 
+def test_without_git_a_run_is_of_no_commit(monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("asked git"))
+    assert benchmark.commit() is None
+
+
 def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):
     own = job(tmp_path).shared.data().path
     job(tmp_path, data=own).shared.data()

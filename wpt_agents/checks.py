@@ -19,9 +19,12 @@ IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
 
 COUNTS = (  # keywords of WPT that count something there must be one of
     *("max_action_dim", "batch_size", "batch_length", "imagine_horizon"),
-    *("num_retrieve", "bc_steps", "bc_batch_size"),
+    *("num_retrieve", "bc_steps", "bc_batch_size", "episode_length"),
 )
-OPTIONAL_COUNTS = ("episode_length",)
+OPTIONAL = (  # keywords that may be None
+    *("learning_rate", "actor_critic_learning_rate", "episode_length", "embodiment", "seed"),
+    *("return_norm", "zero_init_heads"),
+)
 SWITCHES = "return_norm", "zero_init_heads", "compile"
 SHARES = ("gamma", "lam", "target_fraction", "unimix", "offline_ratio")
 AMOUNTS = (  # and those that may be 0 but not less
@@ -47,20 +50,21 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
         else that is no number from 0 on, an unknown choice
     """
     for name, value in given.items():
+        if name in OPTIONAL and value is None:
+            continue
         if name in CHOICES and value not in tuple(CHOICES[name]):
             raise unknown_name(name, value, CHOICES[name])
         number = isinstance(value, Real) and not isinstance(value, bool)
         least = 2 if name == "imagine_horizon" else 1  # the first state's value is no action's
-        whole = number and isinstance(value, Integral) and int(value) >= least
-        if not whole and (name in COUNTS or (name in OPTIONAL_COUNTS and value is not None)):
+        if name in COUNTS and not (number and isinstance(value, Integral) and int(value) >= least):
             raise ValueError(f"{name} is a whole number from {least} on, got {value!r}")
-        if name in SWITCHES and not (value is None or isinstance(value, bool)):
+        if name in SWITCHES and not isinstance(value, bool):
             raise ValueError(f"{name} is True or False, got {value!r}")
         if name in SHARES and not (number and 0 <= value <= 1):
             raise ValueError(f"{name} is a share in [0, 1], got {value!r}")
         if name == "unimix" and value == 0:
             raise ValueError("unimix=0 allows latents of probability 0, whose KL is infinite")
-        if name in AMOUNTS and value is not None and not (number and 0 <= value < np.inf):
+        if name in AMOUNTS and not (number and 0 <= value < np.inf):
             raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 
 

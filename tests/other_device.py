@@ -1,0 +1,97 @@
+"""A second device, as strict as a GPU about where tensors lie, and computed by the CPU.
+
+A tensor of the device "other" holds one of the CPU's. An operator over both kinds fails, as it
+would on a GPU, and so does `numpy()` without `cpu()` before it. What is computed must be what the
+CPU computes.
+"""
+
+from collections import Counter
+from functools import cache, partial
+
+import torch
+from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils.backend_registration import (
+    _DummyBackendModule,
+    _setup_privateuseone_for_python_backend,
+)
+
+aten = torch.ops.aten
+waits = Counter()  # calls that a GPU would have to be waited for, by operator
+
+
+class Elsewhere(torch.Tensor):
+    """A tensor on the device "other"."""
+
+    @staticmethod
+    def __new__(cls, held):
+        wrapper = torch.Tensor._make_wrapper_subclass(
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device="other:0",
+            requires_grad=held.requires_grad,
+        )
+        wrapper.held = held
+        return wrapper
+
+    def __repr__(self):
+        return f"Elsewhere({self.held})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return compute(func, args, kwargs or {})
+
+
+def compute(func, args, kwargs):
+    """What the CPU makes of it, on the device where a GPU would have it."""
+    leaves = tree_leaves((args, kwargs))
+    here = {id(x.held): x for x in leaves if isinstance(x, Elsewhere)}
+    strays = [x for x in leaves if type(x) is torch.Tensor and x.dim()]
+    named = [x for x in leaves if isinstance(x, torch.device)]  # where the result is to lie
+    copies = func is aten.copy_.default
+    if strays and not named and not copies:
+        raise RuntimeError(f"{func} over two devices; on the CPU: {tuple(strays[0].shape)}")
+    out = func(*tree_map(on_cpu, args), **tree_map(on_cpu, kwargs))
+    away = isinstance(args[0], Elsewhere) if copies else not named or named[0].type == "other"
+    waits[str(func)] += not away or isinstance(out, bool | int | float)
+    with torch.inference_mode(False):  # in which such wrappers cannot be viewed
+        return tree_map(lambda x: here.get(id(x), on_other(x)), out) if away else out
+
+
+def on_cpu(x):
+    if isinstance(x, torch.device):
+        return torch.device("cpu")
+    return x.held if isinstance(x, Elsewhere) else x
+
+
+def on_other(x):
+    return Elsewhere(x) if isinstance(x, torch.Tensor) else x
+
+
+class Backend(_DummyBackendModule):
+    """What torch asks of a device, and of `torch.autocast` there."""
+
+    def get_amp_supported_dtype(self):
+        return [torch.bfloat16]
+
+
+@cache
+def register():
+    """Makes "other" known to torch."""
+    _setup_privateuseone_for_python_backend("other", Backend())
+    kernels = torch.library.Library("aten", "IMPL")
+    for maker in aten.empty.memory_format, aten.empty_strided.default:
+        kernels.impl(maker, partial(made, maker), "PrivateUse1")
+    kernels.impl(aten._copy_from.default, copied, "PrivateUse1")  # for `torch.tensor`
+    return kernels  # they last as long as their library
+
+
+def made(maker, *args, device, **kwargs):
+    return Elsewhere(maker(*args, device="cpu", **kwargs))
+
+
+def copied(source, target, non_blocking=False):
+    on_cpu(target).copy_(on_cpu(source))
+    return target

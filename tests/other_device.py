@@ -6,7 +6,7 @@ CPU computes.
 """
 
 from collections import Counter
-from functools import cache, partial
+from functools import partial
 
 import pytest
 import torch
@@ -79,17 +79,6 @@ class Backend(backend_registration._DummyBackendModule):
         return [torch.bfloat16]
 
 
-@cache
-def register():
-    """Makes "other" known to torch."""
-    backend_registration._setup_privateuseone_for_python_backend("other", Backend())
-    kernels = torch.library.Library("aten", "IMPL")
-    for maker in aten.empty.memory_format, aten.empty_strided.default:
-        kernels.impl(maker, partial(made, maker), "PrivateUse1")
-    kernels.impl(aten._copy_from.default, copied, "PrivateUse1")  # for `torch.tensor`
-    return kernels  # they last as long as their library
-
-
 def made(maker, *args, device, **kwargs):
     return Elsewhere(maker(*args, device="cpu", **kwargs))
 
@@ -97,3 +86,11 @@ def made(maker, *args, device, **kwargs):
 def copied(source, target, non_blocking=False):
     on_cpu(target).copy_(on_cpu(source))
     return target
+
+
+# When it is imported, as autograd's first way back, of whatever test, counts the devices there are.
+backend_registration._setup_privateuseone_for_python_backend("other", Backend())
+kernels = torch.library.Library("aten", "IMPL")  # which last as long as it
+for maker in aten.empty.memory_format, aten.empty_strided.default:
+    kernels.impl(maker, partial(made, maker), "PrivateUse1")
+kernels.impl(aten._copy_from.default, copied, "PrivateUse1")  # for `torch.tensor`

@@ -104,7 +104,7 @@ def test_shares_of_a_batch_are_the_batch(folder):
 
 @pytest.mark.parametrize("free_nats", [0.1, 0.4, 2.0])
 def test_shares_clip_the_kl_where_the_whole_batch_does(free_nats):
-    image = torch.zeros(2, 1, 1, 1, 1)
+    error = torch.zeros(2, 1)
     # one sequence's KL(q || p) is .8 ln(.8 / .5) + .2 ln(.2 / .5) = .193, the other's .95 ln(1.9) +
     # .05 ln(.1) = .495; the mean is .344: .4 clips the whole, but not the second by itself
     post = torch.tensor([[0.8, 0.2], [0.95, 0.05]]).log().view(2, 1, 1, 2).requires_grad_()
@@ -112,7 +112,7 @@ def test_shares_clip_the_kl_where_the_whole_batch_does(free_nats):
 
     def gradients(rows, whole=None):
         loss = world_model_loss(
-            image[rows], image[rows], post[rows], prior[rows], free_nats=free_nats, whole=whole
+            error[rows], post[rows], prior[rows], free_nats=free_nats, whole=whole
         )
         return loss.total.item(), torch.autograd.grad(loss.total, (post, prior))
 

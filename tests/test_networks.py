@@ -11,6 +11,8 @@ from wpt_agents.networks import (
     Encoder,
     FromPixel,
     Head,
+    SmallUpConv,
+    ToPixels,
     UpConv,
     frozen,
     to_uint8,
@@ -38,6 +40,21 @@ def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, wi
     theirs = torch.autograd.grad((plain * weight).sum(), leaves)
     for a, b in zip(torch.autograd.grad((result * weight).sum(), leaves), theirs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("layer", "kernel", "width"), [(SmallUpConv, 5, 5), (ToPixels, 6, 30)])
+def test_what_bfloat16_computes_otherwise_is_the_transposed_convolution_too(layer, kernel, width):
+    ours, x = layer(3, 2, kernel), noise(2, 3, width, width).requires_grad_()
+    plain = torch.nn.functional.conv_transpose2d(x, ours.weight, ours.bias, stride=2)
+    leaves, weight = (x, ours.weight, ours.bias), noise(*plain.shape, seed=1)
+    expected = torch.autograd.grad((plain * weight).sum(), leaves)
+    torch.testing.assert_close(ours(x), plain, rtol=1e-5, atol=1e-5)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = ours(x)
+    assert result.dtype == (torch.float32 if layer is ToPixels else torch.bfloat16)
+    torch.testing.assert_close(result.float(), plain, rtol=0.02, atol=0.02)
+    for a, b in zip(torch.autograd.grad((result * weight).sum(), leaves), expected, strict=True):
+        assert (a - b).abs().max() < 0.02 * b.abs().max()
 
 
 def test_a_downconv_of_a_single_image_is_the_strided_convolution():

@@ -18,7 +18,6 @@ from wpt_agents.zoo import diagnosis
 
 @pytest.fixture
 def other(monkeypatch):
-    other_device.register()
     for module in policy, updates, wpt, diagnosis:  # random numbers are the CPU's on both devices
         monkeypatch.setattr(module, "Generator", lambda device: torch.Generator())
     monkeypatch.setattr(

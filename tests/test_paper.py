@@ -13,7 +13,7 @@ from wpt_agents.actor_critic import actor_loss, critic_loss, lambda_return
 from wpt_agents.behavior_cloning import bc_loss
 from wpt_agents.guidance import draw_window, parse_schedule
 from wpt_agents.retrieval import Retriever
-from wpt_agents.world_model import reward_loss, world_model_loss
+from wpt_agents.world_model import reward_loss, squared_error, world_model_loss
 
 
 def probabilities(*rows):
@@ -28,13 +28,14 @@ def test_eq_1_world_model_loss():
     # KL(q || p): step 0: .8 ln(.8 / .5) + .2 ln(.2 / .5) = .19274; step 1: 0. The mean is .09637
     post = probabilities([0.8, 0.2], [0.3, 0.7]).view(1, 2, 1, 2)
     prior = probabilities([0.5, 0.5], [0.3, 0.7]).view(1, 2, 1, 2)
-    loss = world_model_loss(image, reconstruction, post, prior, 1.0, 0.1, free_nats=0.0)
+    error = squared_error(image, reconstruction)
+    loss = world_model_loss(error, post, prior, 1.0, 0.1, free_nats=0.0)
     kl = (0.8 * math.log(1.6) + 0.2 * math.log(0.4)) / 2
     assert loss.reconstruction.item() == pytest.approx(307.2, rel=1e-5)
     assert loss.kl.item() == pytest.approx(kl, rel=1e-5)
     assert loss.total.item() == pytest.approx(307.2 + 1.1 * kl, rel=1e-5)
     # Below a nat both terms stand at one nat: 1.0 * 1 + 0.1 * 1
-    free = world_model_loss(image, reconstruction, post, prior)
+    free = world_model_loss(error, post, prior)
     assert free.total.item() == pytest.approx(307.2 + 1.1, rel=1e-5)
 
 

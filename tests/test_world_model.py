@@ -9,13 +9,14 @@ import torch
 from wpt_agents.actor_critic import Actor, Critic
 from wpt_agents.behavior_cloning import PriorActor
 from wpt_agents.distributions import symexp
-from wpt_agents.networks import SIZES
+from wpt_agents.networks import SIZES, to_unit
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.world_model import (
     WorldModel,
     reward_loss,
+    squared_error,
     world_model_loss,
     world_model_update_loss,
 )
@@ -36,8 +37,7 @@ def seeded(seed=0):
 
 def loss_of(post, prior, **options):
     """Eq. (1) with a perfect reconstruction: only the KL terms are left."""
-    blank = torch.zeros(*post.shape[:2], 64, 64, 3)
-    return world_model_loss(blank, blank, post, prior, **options)
+    return world_model_loss(torch.zeros(post.shape[:2]), post, prior, **options)
 
 
 def logits(*steps, groups=1):
@@ -89,6 +89,15 @@ def test_the_kl_is_summed_over_the_groups_before_free_nats():
     # three groups of KL = .368 make 1.104, above one nat
     loss = loss_of(logits(SURE, groups=3), logits(EVEN, groups=3), free_nats_mode="element")
     assert loss.total.item() == pytest.approx(1.1 * 3 * KL)
+
+
+def test_the_reconstruction_error_in_pieces_is_that_of_all_images(monkeypatch):
+    model, batch = WorldModel(DEBUG, WIDTH), windows(turn(6))
+    post, _, _ = model.observe(batch, seeded())
+    expected = squared_error(to_unit(batch.image), model.decode(post))
+    assert expected.shape == batch.image.shape[:2]
+    monkeypatch.setattr("wpt_agents.networks.PIECE", 2 * model.decoder.largest)  # 2 + 2 + 2 + 1
+    torch.testing.assert_close(model.reconstruction_error(post, batch.image), expected)
 
 
 def test_only_the_reconstruction_reaches_the_decoder():

@@ -131,7 +131,7 @@ class Encoder(nn.Module):
         """(..., 64, 64, channels_in) uint8 -> (..., E)."""
         assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
         x = to_unit(image).flatten(0, -4).permute(0, 3, 1, 2)  # channels_last in memory
-        x = in_pieces(self.layers, x, 31 * 31 * self.depth)
+        x = in_pieces(self.layers, 31 * 31 * self.depth, x)
         return x.flatten(1).unflatten(0, image.shape[:-3])
 
 
@@ -160,6 +160,32 @@ class UpConv(nn.ConvTranspose2d):
         return out.permute(0, 3, 1, 2)
 
 
+class SmallUpConv(UpConv):
+    """An `UpConv` of few pixels; torch's own is as quick there, but not on a CPU in bfloat16."""
+
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
+        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+        if in_bfloat16(x):
+            return super().forward(x)
+        return F.conv_transpose2d(x, self.weight, self.bias, stride=2)
+
+
+class ToPixels(UpConv):
+    """The last `UpConv`; on a CPU in float32 always, as bfloat16 takes longer for few channels."""
+
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
+        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+        if not in_bfloat16(x):
+            return super().forward(x)
+        with torch.autocast("cpu", enabled=False):
+            return super().forward(x.float())
+
+
+def in_bfloat16(x: Tensor) -> bool:
+    """Whether a convolution of `x` is about to be computed in bfloat16, on a CPU."""
+    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu")
+
+
 class FromPixel(nn.ConvTranspose2d):
     """A transposed convolution of a single pixel, computed as the matrix product that it is."""
 
@@ -177,7 +203,6 @@ class Decoder(nn.Module):
     def __init__(self, size: Size) -> None:
         super().__init__()
         width, code, depth = 2 * size.hidden, 32 * size.depth, size.depth
-        self.depth = depth
         self.from_deter = nn.Sequential(
             BlockLinear(size.deter, width, size.blocks),
             nn.LayerNorm(width, eps=NORM_EPS),
@@ -191,20 +216,27 @@ class Decoder(nn.Module):
             FromPixel(code, 4 * depth, 5),
             ChannelNorm(4 * depth),
             nn.SiLU(),
-            nn.ConvTranspose2d(4 * depth, 2 * depth, 5, 2),
+            SmallUpConv(4 * depth, 2 * depth, 5),
             ChannelNorm(2 * depth),
             nn.SiLU(),
             UpConv(2 * depth, depth, 6),
             ChannelNorm(depth),
             nn.SiLU(),
-            UpConv(depth, 3, 6),
+            ToPixels(depth, 3, 6),
         )
+        self.largest = 32 * 32 * max(depth, 12)  # numbers of an image where it has most
 
     def forward(self, deter: Tensor, stoch: Tensor) -> Tensor:
         """(N, D), (N, S, K) -> (N, 64, 64, 3), about -0.5 .. 0.5."""
-        code = self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
-        image = in_pieces(self.layers, code[..., None, None], 32 * 32 * max(self.depth, 12))
-        return image.permute(0, 2, 3, 1)
+        return in_pieces(self.images, self.largest, self.code(deter, stoch))
+
+    def code(self, deter: Tensor, stoch: Tensor) -> Tensor:
+        """(N, D), (N, S, K) -> (N, C), from which `images` makes the images."""
+        return self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
+
+    def images(self, code: Tensor) -> Tensor:
+        """(N, C) -> (N, 64, 64, 3), about -0.5 .. 0.5, all at once."""
+        return self.layers(code[..., None, None]).permute(0, 2, 3, 1)
 
 
 class Head(nn.Module):
@@ -231,15 +263,15 @@ class Head(nn.Module):
     def forward(self, feat: Tensor) -> Tensor:
         """(..., D + S*K) -> (..., outputs)."""
         flat = feat.reshape(-1, feat.shape[-1])
-        return in_pieces(self._rows, flat, 2 * self.units).unflatten(0, feat.shape[:-1])
+        return in_pieces(self._rows, 2 * self.units, flat).unflatten(0, feat.shape[:-1])
 
     def _rows(self, feat: Tensor) -> Tensor:
         deter, stoch = feat[:, : self.deter_dim], feat[:, self.deter_dim :]
         return self.layers(self.from_deter(deter) + self.from_stoch(stoch))
 
 
-def in_pieces(layers: Callable[[Tensor], Tensor], x: Tensor, largest: int) -> Tensor:
-    """`layers(x)`, on a CPU for a few rows at a time.
+def in_pieces(layers: Callable[..., Tensor], largest: int, *inputs: Tensor) -> Tensor:
+    """`layers(*inputs)`, on a CPU for a few of their rows at a time.
 
     Memory beyond 32 MB is not kept by glibc's malloc but given back, and fetched from the system
     page by page at the next call, which takes about as long as the arithmetic.
@@ -247,9 +279,10 @@ def in_pieces(layers: Callable[[Tensor], Tensor], x: Tensor, largest: int) -> Te
     :param largest: the numbers that a row has where it has most
     """
     rows = max(1, PIECE // largest)
-    if x.device.type != "cpu" or len(x) <= rows:
-        return layers(x)
-    return torch.cat([layers(piece) for piece in x.split(rows)])
+    if inputs[0].device.type != "cpu" or len(inputs[0]) <= rows:
+        return layers(*inputs)
+    pieces = zip(*(x.split(rows) for x in inputs), strict=True)
+    return torch.cat([layers(*piece) for piece in pieces])
 
 
 def to_unit(image: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import BINS, kl_one_hot, two_hot_loss, two_hot_mean
 from wpt_agents.names import unknown_name
-from wpt_agents.networks import Decoder, Encoder, Head, Size, to_uint8, to_unit
+from wpt_agents.networks import Decoder, Encoder, Head, Size, in_pieces, to_uint8, to_unit
 from wpt_agents.rssm import RSSM, Latent
 from wpt_agents.trajectory import Batch
 
@@ -22,9 +22,19 @@ class WorldModelLoss(NamedTuple):
     kl: Tensor
 
 
+def squared_error(image: Tensor, reconstruction: Tensor) -> Tensor:
+    """-ln p(o_t | z_t, h_t) of a Gaussian of fixed variance, up to constants: summed over a frame.
+
+    :param image: (..., 64, 64, 3), the true frames in [-0.5, 0.5]
+    :param reconstruction: (..., 64, 64, 3)
+    :return: (...)
+    """
+    assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
+    return F.mse_loss(reconstruction, image, reduction="none").sum((-3, -2, -1))
+
+
 def world_model_loss(
-    image: Tensor,
-    reconstruction: Tensor,
+    error: Tensor,
     post_logits: Tensor,
     prior_logits: Tensor,
     dyn_scale: float = 1.0,
@@ -35,12 +45,10 @@ def world_model_loss(
 ) -> WorldModelLoss:
     """Eq. (1): -ln p(o_t | z_t, h_t) + beta KL(q(z_t | h_t, o_t) || p(z_t | h_t)).
 
-    The reconstruction term is a squared error summed over a frame, the likelihood of a Gaussian of
-    fixed variance up to constants. The KL is balanced as in DreamerV3: `dyn_scale` teaches the
+    The KL is balanced as in DreamerV3: `dyn_scale` teaches the
     prior, `rep_scale` the posterior; below `free_nats` a term teaches nothing.
 
-    :param image: (B, T, 64, 64, 3), the true frames in [-0.5, 0.5]
-    :param reconstruction: (B, T, 64, 64, 3)
+    :param error: (B, T), what `squared_error` makes of the first term
     :param post_logits: (B, T, S, K) log-probabilities of q
     :param prior_logits: (B, T, S, K) log-probabilities of p
     :param free_nats_mode: clip the mean over the batch ("mean", as WPT) or each element ("element",
@@ -48,9 +56,9 @@ def world_model_loss(
     :param whole: where this is a share of a batch, what turns its mean KL into the whole batch's,
         whose clip "mean" means
     """
-    assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
     assert post_logits.shape == prior_logits.shape, (post_logits.shape, prior_logits.shape)
-    error = F.mse_loss(reconstruction, image, reduction="sum") / image.shape[:-3].numel()
+    assert error.shape == post_logits.shape[:2], (error.shape, post_logits.shape)
+    error = error.mean()
     dyn = kl_one_hot(post_logits.detach(), prior_logits)
     rep = kl_one_hot(post_logits, prior_logits.detach())
     if free_nats_mode not in ("mean", "element"):
@@ -114,6 +122,20 @@ class WorldModel(nn.Module):
         flat = latent.flatten_time()
         return self.decoder(flat.deter, flat.stoch).unflatten(0, latent.deter.shape[:2])
 
+    def reconstruction_error(self, latent: Latent, image: Tensor) -> Tensor:
+        """`squared_error` of decoding (B, T, ...) states, against (B, T, 64, 64, 3) uint8: (B, T).
+
+        On a CPU a few images at a time, so that they never take much memory.
+        """
+        flat, decoder = latent.flatten_time(), self.decoder
+
+        def error(image: Tensor, code: Tensor) -> Tensor:
+            return squared_error(to_unit(image), decoder.images(code))
+
+        code = decoder.code(flat.deter, flat.stoch)
+        errors = in_pieces(error, decoder.largest, image.flatten(0, 1), code)
+        return errors.unflatten(0, image.shape[:2])
+
     def reward(self, feat: Tensor) -> Tensor:
         """The reward that came with arriving in a state: (..., D + S*K) -> (...)."""
         return two_hot_mean(self.reward_head(feat))
@@ -146,7 +168,5 @@ def world_model_update_loss(
     :param options: the keywords of `world_model_loss`
     """
     post, post_logits, prior_logits = model.observe(batch, generator)
-    loss = world_model_loss(
-        to_unit(batch.image), model.decode(post), post_logits, prior_logits, **options
-    )
-    return loss, post
+    error = model.reconstruction_error(post, batch.image)
+    return world_model_loss(error, post_logits, prior_logits, **options), post

@@ -1,6 +1,8 @@
+import gc
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -213,6 +215,37 @@ def test_lengths_widths_and_labels(tmp_path):
 def test_an_index_past_the_end_is_an_index_error(tmp_path):
     with pytest.raises(IndexError):
         made(tmp_path, chain(4))[1]
+
+
+def test_a_subset_by_mask_is_of_those_that_are_true(tmp_path):
+    dataset = made(tmp_path, *(chain(5 + i) for i in range(3)))
+    for mask in ([False, True, True], dataset.lengths > 5):
+        assert dataset.subset(mask).lengths.tolist() == [6, 7]
+    assert len(dataset.subset([])) == len(dataset.subset([False] * 3)) == 0
+    with pytest.raises(ValueError, match="mask of 2 for 3 trajectories"):
+        dataset.subset([True, False])
+
+
+def test_a_subset_of_trajectories_in_memory_outlives_them():
+    view = TrajectoryDataset.of([chain(5, size=64)]).subset([0])
+    gc.collect()
+    assert len(view[0]) == 5
+
+
+def test_a_shard_of_another_dataset_is_told_from_its_own(tmp_path):
+    for name, seed in (("a", 0), ("b", 9)):
+        made(tmp_path / name, chain(20, seed), codec="raw")
+    shard = "shard-00000.bin"
+    (tmp_path / "a" / shard).write_bytes((tmp_path / "b" / shard).read_bytes())
+    dataset = TrajectoryDataset.open(tmp_path / "a")
+    with pytest.raises(ValueError, match="another trajectory than the index names"):
+        dataset[0]
+    assert len(dataset.validate()) == 1
+
+
+def test_numbers_of_numpy_are_taken(tmp_path):
+    old = replace(chain(5), terminated=np.bool_(True), action_dim=np.int64(2))
+    assert made(tmp_path, old)[0].terminated
 
 
 def test_a_subset_is_a_view_in_the_order_given(tmp_path):

@@ -245,6 +245,18 @@ def test_a_second_process_is_refused_with_the_reason(tmp_path):
     assert len(TrajectoryDataset.open(tmp_path)) == 1
 
 
+def test_a_process_forked_off_keeps_nobody_from_writing_on(tmp_path):
+    with TrajectoryDataset.create(tmp_path, image_size=8) as dataset:
+        dataset.append(chain(20))
+        other = started(signal.pause)
+    try:
+        with TrajectoryDataset.open(tmp_path) as dataset:
+            dataset.append(chain(20))
+    finally:
+        other.kill()
+        other.join()
+
+
 def read_on(path, expected):
     for _ in range(20):
         dataset = TrajectoryDataset.open(path)

@@ -112,6 +112,8 @@ def test_an_episode_is_truncated_after_its_frames_and_never_terminated(name):
     still = np.zeros(task.action_dim, np.float32)
     ends = [env.step(still)[2:4] for _ in range(task.frames)]
     assert ends == [(False, False)] * (task.frames - 1) + [(False, True)]
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\)"):
+        env.step(still)
 
 
 @pytest.mark.parametrize("task", DMC, ids=lambda task: task.name)

@@ -237,6 +237,20 @@ def test_an_explorer_learns_and_another_seed_plays_otherwise(kind):
     assert not np.array_equal(played[0].action, next(other.explore(1)).action)
 
 
+def test_exploring_never_goes_on_with_an_episode_that_learn_left():
+    agent = explorer(ICMExplorer)
+    agent.learn(30)  # an episode of 25 steps, and 5 of the next
+    for played in agent.explore(3):
+        assert len(played) == 25
+
+
+def test_an_explorers_file_is_read_by_its_own_class(tmp_path):
+    explorer(ICMExplorer).save(tmp_path / "curious.zip")
+    for other in (WPT, Plan2Explore):
+        with pytest.raises(ValueError, match=r"is of ICMExplorer: read it by ICMExplorer\.load"):
+            other.load(tmp_path / "curious.zip")
+
+
 @pytest.mark.parametrize("kind", EXPLORERS.values())
 def test_a_loaded_explorer_goes_on_as_if_it_had_never_stopped(kind, tmp_path):
     whole = list(explorer(kind).explore(4))

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -80,7 +81,7 @@ def test_actions_without_limits_are_refused():
         rescaled(np.zeros(3), [0.0], [1.0])
 
 
-@pytest.mark.parametrize("form", ["hdf5", "lerobot", "rlds"])
+@pytest.mark.parametrize("form", ["hdf5", "lerobot", "npz", "rlds"])
 @pytest.mark.parametrize("limit", ["low", "high"])
 def test_one_limit_without_the_other_is_refused(tmp_path, form, limit):
     with pytest.raises(ValueError, match=r"low and high, .* belong together; got low=.* and high="):
@@ -128,6 +129,14 @@ def test_npz_actions_lead_the_observation_and_are_shifted_back(tmp_path, key, ov
     [new] = open_episodes(tmp_path, embodiment="walker", **SMALL)
     check_same(new, old)
     assert (new.embodiment, new.source) == ("walker", "20240101T000000-ab-0-20.npz")
+
+
+def test_npz_actions_are_rescaled_from_the_limits_given(tmp_path):
+    old = chain(5)
+    large = replace(old, action=old.action / 4)  # in [-1/4, 1/4]
+    save_npz(tmp_path / "0.npz", large)
+    [new] = open_episodes(tmp_path, low=[-0.25] * 2, high=[0.25] * 2, **SMALL)
+    np.testing.assert_allclose(new.action, old.action, atol=1e-6)
 
 
 def test_rewards_are_left_out_unless_asked_for(tmp_path):
@@ -247,6 +256,27 @@ def test_a_dataset_of_another_source_is_not_added_to(tmp_path):
         TrajectoryDataset.from_npz(tmp_path / "b", tmp_path / "out", **SMALL)
 
 
+@pytest.mark.parametrize("count", [3, 5])
+def test_a_source_whose_files_have_the_same_names_is_not_added_to(tmp_path, count):
+    for i in range(3):
+        save_npz(tmp_path / f"walker/{i}.npz", chain(5, i))
+    for i in range(count):
+        save_npz(tmp_path / f"cheetah/{i}.npz", chain(5, 10 + i))
+    TrajectoryDataset.from_npz(tmp_path / "walker", tmp_path / "out", **SMALL)
+    with pytest.raises(ValueError, match="3 trajectories of another source"):
+        TrajectoryDataset.from_npz(tmp_path / "cheetah", tmp_path / "out", **SMALL)
+    assert len(TrajectoryDataset.open(tmp_path / "out")) == 3
+
+
+def test_the_same_actions_seen_by_another_camera_are_another_source(tmp_path):
+    seen = chain(5)
+    save_npz(tmp_path / "a/0.npz", seen)
+    save_npz(tmp_path / "b/0.npz", replace(seen, image=255 - seen.image))
+    TrajectoryDataset.from_npz(tmp_path / "a", tmp_path / "out", **SMALL)
+    with pytest.raises(ValueError, match="another source"):
+        TrajectoryDataset.from_npz(tmp_path / "b", tmp_path / "out", **SMALL)
+
+
 def test_a_conversion_does_not_go_on_under_another_label(tmp_path):
     for i in range(2):
         save_npz(tmp_path / f"in/{i}.npz", chain(5, i))
@@ -337,6 +367,21 @@ def test_an_sb3_buffer_comes_back_as_its_episodes(channels_first):
     assert len(new) == 3
     for found, expected in zip(new, old, strict=True):
         check_same(found, expected)
+
+
+def test_an_episode_that_sb3_left_for_a_new_one_ends_there():
+    old = [chain(5, 0), chain(7, 1), chain(4, 2)]
+    buffer = sb3_buffer(old, 50)
+    buffer.dones[4] = 0  # `learn` was called again in the middle of the first
+    new = list(SB3Episodes(buffer, **SMALL))
+    assert [len(trajectory) for trajectory in new] == [5, 7, 4]
+    check_same(new[0], replace(old[0], terminated=False))
+
+
+def test_discrete_actions_of_sb3_are_refused():
+    image = gym.spaces.Box(0, 255, (3, 8, 8), np.uint8)
+    with pytest.raises(ValueError, match=r"actions are Discrete\(2\); they must be a Box"):
+        SB3Episodes(SB3Buffer(5, image, gym.spaces.Discrete(2), "cpu"))
 
 
 def test_a_ring_that_has_gone_round_is_read_oldest_first():

@@ -73,6 +73,13 @@ def test_the_suffix_is_added_only_where_there_is_none(tmp_path):
     assert {p.name for p in (tmp_path / "new").iterdir()} == {"plain.zip", "model.v2", "model.zip"}
 
 
+def test_a_model_of_numpys_numbers_is_saved(tmp_path):
+    numbers = {"gamma": np.float32(0.5), "max_action_dim": np.int64(3), "seed": np.arange(3)[1]}
+    agent(return_norm=np.True_, **numbers).save(tmp_path / "model.zip")
+    loaded = WPT.load(tmp_path / "model.zip")
+    assert (loaded.gamma, loaded.max_action_dim, loaded.seed) == (0.5, 3, 1)
+
+
 def test_a_dotted_name_never_loads_another_file(tmp_path):
     agent().save(tmp_path / "model.zip")
     with pytest.raises(FileNotFoundError, match=r"model\.v2"):

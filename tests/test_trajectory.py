@@ -21,6 +21,11 @@ def test_led_to_by_hand():
     assert streams["is_terminal"].tolist() == [False, False, False, True]
 
 
+def test_a_reward_too_large_for_float32_is_refused():
+    with pytest.raises(ValueError, match="reward must be finite"):
+        Trajectory(IMAGE, ACTION, np.array([0, 1e300, 0]))
+
+
 def test_a_window_inside_a_trajectory_starts_afresh_but_keeps_its_reward():
     trajectory = chain(10)
     streams = led_to(trajectory, 4, 7, width=2)

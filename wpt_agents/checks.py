@@ -43,6 +43,11 @@ CHOICES: dict[str, Collection[str]] = {
 }
 
 
+def plain(value: Any) -> Any:
+    """NumPy's numbers as Python's, which a model file can hold."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def check_hyperparameters(given: Mapping[str, Any]) -> None:
     """Refuses values of WPT's keywords that make no sense, each by name.
 

@@ -72,6 +72,7 @@ class TrajectoryDataset(Conversions):
     ) -> None:
         self.path, self.workers = path, workers
         self._meta, self._entries, self._ids = meta, entries, ids
+        self._whole: TrajectoryDataset | None = None
         self._writer: Writer | None = None
         self._windows: Windows | None = None
         self._pool: ThreadPoolExecutor | None = None
@@ -268,6 +269,11 @@ class TrajectoryDataset(Conversions):
         return self._meta.image_size
 
     @property
+    def lossless(self) -> bool:
+        """Whether images are read as they were appended."""
+        return find_codec(self._meta.codec).lossless
+
+    @property
     def is_subset(self) -> bool:
         """Whether this is a view made by `subset`, be it of all trajectories in another order."""
         return self._ids is not None
@@ -282,10 +288,21 @@ class TrajectoryDataset(Conversions):
         return digest.hexdigest()
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> "TrajectoryDataset":
-        """A read-only view of some trajectories, in the order given."""
-        entries = [self._entries[i] for i in indices]
-        ids = [self._id(i) for i in indices]
-        return TrajectoryDataset(self.path, self._meta, entries, ids, self.workers)
+        """A read-only view of some trajectories, in the order given.
+
+        :param indices: their numbers, or a mask: a bool for each trajectory
+        :raises ValueError: a mask of another length
+        """
+        chosen = np.asarray(indices, None if len(indices) else int)
+        if chosen.dtype == bool:
+            if len(chosen) != len(self):
+                raise ValueError(f"A mask of {len(chosen)} for {len(self)} trajectories")
+            chosen = np.flatnonzero(chosen)
+        entries = [self._entries[i] for i in chosen]
+        ids = [self._id(i) for i in chosen]
+        view = TrajectoryDataset(self.path, self._meta, entries, ids, self.workers)
+        view._whole = self  # a temporary folder lasts as long as its dataset
+        return view
 
     def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
         """The first image of every trajectory, in order: (n, 64, 64, 3) uint8 with n <= `batch`."""

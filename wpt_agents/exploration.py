@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
@@ -195,7 +196,8 @@ class Explorer(WPT):
         )
         while self.episodes < episodes:
             self.env.seed(torch_seed(self._stream(RESET, self.episodes)))
-            self._last_obs = self.env.reset()
+            self._last_obs, self._rollout = self.env.reset(), None  # and no half-played episode
+            self._last_episode_starts = np.ones(1, bool)
             self._collect(callback, 0)
             self._update_models()
             yield self.replay_buffer.trajectories[-1]
@@ -204,6 +206,7 @@ class Explorer(WPT):
 class ICMExplorer(Explorer):
     """The reward head learns the forward model's error on real transitions."""
 
+    saved_as = "ICMExplorer"
     curiosity: ICM
 
     def _make_curiosity(self) -> ICM:
@@ -237,6 +240,7 @@ class Plan2Explore(Explorer):
     the same everywhere. Nothing led to the first state of a replayed window, which is paid 0.
     """
 
+    saved_as = "Plan2Explore"
     curiosity: Ensemble
     arrival: Tensor  # (B*T,), of the replayed states that the next dream starts from
 

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -40,6 +40,8 @@ COUNTERS = (  # where a model stands, besides its weights
 class Saving:
     """What of a model is written to its file, and how it is read back."""
 
+    saved_as: ClassVar[str] = "WPT"  # whose networks a file holds
+
     __init__: Callable[..., None]
     set_env: Callable[..., None]
     hyperparameters: dict[str, Any]
@@ -67,6 +69,7 @@ class Saving:
             path = Path(path).with_suffix(".zip")
         space = self.action_space
         about = {
+            "class": self.saved_as,
             "hyperparameters": self.hyperparameters,
             "action_space": {"low": space.low.tolist(), "high": space.high.tolist()},
             "dataset": str(self.dataset.path) if self.dataset is not None else None,
@@ -105,6 +108,10 @@ class Saving:
         if print_system_info:
             get_system_info()
         about, tensors = read_model(path)
+        if (kind := about.get("class", cls.saved_as)) != cls.saved_as:
+            raise ValueError(
+                f"{path} is of {kind}: read it by {kind}.load, not {cls.__name__}.load"
+            )
         model: Self = cls(device=device, **{**about["hyperparameters"], **kwargs})
         low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
         model.action_space = spaces.Box(low, high)

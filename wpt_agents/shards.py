@@ -39,13 +39,17 @@ def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[mem
     with FileIO(path / name) as file:
         file.seek(entry.at + sum(sizes[:first]))
         data = memoryview(file.read(sum(sizes[first : last + 1])))
-    at = 0
+    at, checksum = 0, 0
     for block in range(first, last + 1):
         stored = data[at : at + sizes[block]]
         at += sizes[block]
         if len(stored) < sizes[block] or zlib.crc32(stored[:-4]) != int.from_bytes(stored[-4:]):
             raise OSError(f"block {block} of {name} is cut short or does not match its checksum")
+        checksum = zlib.crc32(stored[-4:], checksum)
         yield stored
+    all_read = first == 0 and last + 1 == len(sizes)
+    if all_read and entry.checksum is not None and checksum != entry.checksum:
+        raise OSError(f"{name} holds another trajectory than the index names there")
 
 
 def read_steps(
@@ -175,6 +179,7 @@ class Writer:
         """Gives the right to write back."""
         self.flush()
         self._shard.close()
+        _unlock(self._index.fileno())
         self._index.close()
 
     def _open_shard(self, number: int, end: int) -> FileIO:
@@ -199,3 +204,9 @@ def _lock(descriptor: int) -> None:
     import fcntl  # the kernel takes the lock back when the writer dies
 
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _unlock(descriptor: int) -> None:
+    import fcntl  # closing is not enough where a forked process holds the file open, too
+
+    fcntl.flock(descriptor, fcntl.LOCK_UN)

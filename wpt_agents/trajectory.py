@@ -52,6 +52,9 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         image, action, reward = self.image, self.action, self.reward
+        if reward is not None:
+            with np.errstate(over="ignore"):  # to infinity, which is refused below
+                reward = np.asarray(reward).astype(np.float32)
         if image.ndim != 4 or image.shape[-1] != 3 or image.dtype != np.uint8:
             raise ValueError(
                 f"Trajectory.image must be (T + 1, H, W, 3) uint8, got {image.shape} {image.dtype}"
@@ -71,9 +74,9 @@ class Trajectory:
         if not 0 <= self.action_dim <= action.shape[1]:
             raise ValueError(f"action_dim {self.action_dim} exceeds the width {action.shape[1]}")
         object.__setattr__(self, "action", np.asarray(action, np.float32))
-        object.__setattr__(self, "action_dim", self.action_dim or action.shape[1])
-        if reward is not None:
-            object.__setattr__(self, "reward", np.asarray(reward, np.float32))
+        object.__setattr__(self, "action_dim", int(self.action_dim) or action.shape[1])
+        object.__setattr__(self, "terminated", bool(self.terminated))
+        object.__setattr__(self, "reward", reward)
 
     def __len__(self) -> int:
         """The number of actions, T."""

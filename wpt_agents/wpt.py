@@ -37,6 +37,7 @@ from wpt_agents.checks import (
     check_rewards,
     check_spaces,
     check_trajectory,
+    plain,
 )
 from wpt_agents.compiled import compile_loops
 from wpt_agents.dataset import TrajectoryDataset
@@ -194,7 +195,7 @@ class WPT(Pretraining, BaseAlgorithm):
         device: torch.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        given = {k: v for k, v in locals().items() if k in HYPERPARAMETERS}
+        given = {k: plain(v) for k, v in locals().items() if k in HYPERPARAMETERS}
         self.hyperparameters = given
         check_hyperparameters(given)
         for name, value in given.items():
@@ -206,7 +207,7 @@ class WPT(Pretraining, BaseAlgorithm):
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
-            seed=seed,
+            seed=given["seed"],
             support_multi_env=True,
         )
         self.stream_seed = torch_seed(np.random.default_rng())  # unless a seed is given

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 
 from wpt_envs import tasks
 from wpt_envs.rendering import Camera, View  # before dm_control: it chooses the GL backend
@@ -134,6 +135,8 @@ class DMControl(Simulated):
             low, high = self._range
             action = low + (action + 1) / 2 * (high - low)
         timestep = self.dm_env.step(action)
+        if timestep.first():  # dm_control begins a new episode by itself
+            raise ResetNeeded("The episode has ended: call reset() before the next step()")
         terminated = timestep.last() and timestep.discount == 0
         truncated = timestep.last() and not terminated
         return _flat(timestep.observation), float(timestep.reward), terminated, truncated, {}

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from wpt_agents.importers.episodes import Episodes
@@ -98,7 +99,7 @@ class Conversions:
         dataset = store.open_or_create(path, episodes.image_size)
         done = dataset.appended
         known = done > 0 and len(dataset) == done  # else the last one may be set aside
-        if done > len(episodes) or (known and _label(dataset[-1]) != _label(episodes[done - 1])):
+        if done > len(episodes) or (known and not _same(dataset, episodes[done - 1])):
             raise ValueError(
                 f"{path} holds {done} trajectories of another source or with other labels; "
                 "convert to another folder"
@@ -189,6 +190,17 @@ class Conversions:
 
 def _trajectories(data: Iterable[Trajectory] | ReplayBuffer) -> Iterator[Trajectory]:
     yield from SB3Episodes(data) if isinstance(data, ReplayBuffer) else data
+
+
+def _same(dataset: Any, read: Trajectory) -> bool:
+    """Whether a dataset's last trajectory is this one: sources alike may be named alike."""
+    stored = dataset[-1]
+    return (
+        _label(stored) == _label(read)
+        and np.array_equal(stored.action, read.action[:, : read.action_dim])
+        and stored.image.shape == read.image.shape
+        and (not dataset.lossless or np.array_equal(stored.image, read.image))
+    )
 
 
 def _label(trajectory: Trajectory) -> tuple[Any, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, needs, rescaled
+from wpt_agents.importers.episodes import Episodes, both_limits, needs, rescaled
 from wpt_agents.trajectory import Trajectory
 
 
@@ -22,12 +22,20 @@ class MinariEpisodes(Episodes):
 
     :param name: a local dataset's name (`namespace/name-v0`), its folder, or the `data` in it
     :param image_key: where the images are in a dictionary observation; dots go deeper
+    :param low: (A,) the actions' limits, if not those of the action space
+    :param high: (A,)
     """
 
     def __init__(
-        self, name: str | os.PathLike[str], image_key: str | None = None, **options: Any
+        self,
+        name: str | os.PathLike[str],
+        image_key: str | None = None,
+        low: np.ndarray | None = None,
+        high: np.ndarray | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(**options)
+        self._limits = both_limits(low, high)
         minari = needs("minari", "Minari datasets")
         folder = Path(name)
         if folder.exists():
@@ -51,9 +59,10 @@ class MinariEpisodes(Episodes):
         source = f"{self._name} episode {episode.id}"
         if not hasattr(space, "low"):
             raise ValueError(f"{self._name} has the actions {space}; they must be a Box")
+        limits = self._limits or (space.low, space.high)
         return self._trajectory(
             self._images(episode.observations),
-            rescaled(np.asarray(episode.actions), space.low, space.high),
+            rescaled(np.asarray(episode.actions), *limits),
             np.asarray(episode.rewards),
             source=source,
             terminated=bool(episode.terminations[-1]),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.importers.episodes import Episodes, warn_left_out
+from wpt_agents.importers.episodes import Episodes, both_limits, rescaled, warn_left_out
 from wpt_agents.trajectory import Trajectory
 
 IMAGE_KEYS = ("observation", "image", "pixels")
@@ -24,12 +24,20 @@ class NpzEpisodes(Episodes):
 
     :param folder: searched for episodes
     :param image_key: the images' array; else the first found of observation, image, pixels
+    :param low: (A,) the actions' limits, if they are not in [-1, 1]
+    :param high: (A,)
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], image_key: str | None = None, **options: Any
+        self,
+        folder: str | os.PathLike[str],
+        image_key: str | None = None,
+        low: np.ndarray | None = None,
+        high: np.ndarray | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(**options)
+        self._limits = both_limits(low, high)
         self._folder, self._keys = Path(folder), (image_key,) if image_key else IMAGE_KEYS
         files = sorted(self._folder.rglob("*.npz"))
         if not files:
@@ -68,10 +76,13 @@ class NpzEpisodes(Episodes):
                 f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
                 "write a file an episode"
             )
+        action = arrays["action"][1:]
+        if self._limits:
+            action = rescaled(action, *self._limits)
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         return self._trajectory(
             arrays[key],
-            arrays["action"][1:],
+            action,
             arrays["reward"][1:] if "reward" in arrays else None,
             source=file.relative_to(self._folder).as_posix(),
             terminated=bool(np.ravel(over)[-1] == 1),

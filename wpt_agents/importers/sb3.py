@@ -2,7 +2,8 @@
 
 Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it rescaled. With
 `optimize_memory_usage` the observation after an episode's last action is overwritten, so that
-action is left out, and no terminal state is seen.
+action is left out, and no terminal state is seen; nor is it seen where `learn` was called again and
+left an episode for a new one, which then is taken for its continuation.
 """
 
 import os
@@ -11,6 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl
 
@@ -38,6 +40,8 @@ class SB3Episodes(Episodes):
             buffer = _load(buffer, trust)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"Expected a ReplayBuffer of SB3, got {type(buffer).__name__}")
+        if not isinstance(buffer.action_space, spaces.Box):
+            raise ValueError(f"The buffer's actions are {buffer.action_space}; they must be a Box")
         self._buffer, self._key = buffer, image_key
         self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
         first = buffer.pos if buffer.full else 0
@@ -51,11 +55,21 @@ class SB3Episodes(Episodes):
     def _find_bounds(self, env: int) -> list[tuple[int, int, int]]:
         """Environment, first row in order of age, and one past the last, for each episode."""
         ends = np.flatnonzero(self._buffer.dones[self._rows, env]) + 1
-        edges = np.unique(np.concatenate([[0], ends, [len(self._rows)]])).tolist()
+        cuts = [0], ends, self._find_resets(env), [len(self._rows)]
+        edges = np.unique(np.concatenate(cuts).astype(int)).tolist()
         shortest = 2 if self._overwritten else 1
         bounds = [(env, a, b) for a, b in pairwise(edges) if b - a >= shortest]
         warn_left_out(len(edges) - 1 - len(bounds), f"SB3 replay buffer, environment {env}")
         return bounds
+
+    def _find_resets(self, env: int) -> list[int]:
+        """Where an observation is not what the step before led to: `learn` has begun anew."""
+        if self._overwritten:
+            return []
+        seen = self._images(self._buffer.observations)
+        led_to = self._images(self._buffer.next_observations)
+        steps = enumerate(pairwise(self._rows), start=1)
+        return [i for i, (a, b) in steps if not np.array_equal(led_to[a, env], seen[b, env])]
 
     def __len__(self) -> int:
         return len(self._bounds)

@@ -104,7 +104,7 @@ def import_data(
     camera: Annotated[str | None, typer.Option(help="lerobot: which, if several.")] = None,
     split: Annotated[str | None, typer.Option(help="rlds: only this one, e.g. train.")] = None,
     low: Annotated[
-        str | None, typer.Option(help="hdf5, lerobot, rlds: the actions' limits, `--low=-2,-2`.")
+        str | None, typer.Option(help="All but sb3: the actions' limits, `--low=-2,-2`.")
     ] = None,
     high: Annotated[str | None, typer.Option(help="`--high=2,2`.")] = None,
     trust: Annotated[

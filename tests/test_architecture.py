@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = [
-    {"trajectory", "distributions", "networks", "guidance", "archive", "names", "codecs"},
+    {"trajectory", "distributions", "networks", "guidance", "images", "archive", "names", "codecs"},
     {"windows", "index", "shards", "model_file", "scan", "importers"},
     {"dataset", "replay", "rssm", "actor_critic", "behavior_cloning"},
     {"retrieval", "world_model", "checks", "acting"},

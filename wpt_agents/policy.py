@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
@@ -15,6 +14,7 @@ from wpt_agents.acting import FastStep
 from wpt_agents.actor_critic import Actor, Critic
 from wpt_agents.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.distributions import Noise
+from wpt_agents.images import resized
 from wpt_agents.networks import Size, frozen
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
@@ -51,9 +51,7 @@ def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarr
             f"{observation.shape} {observation.dtype}; render the environment to pixels"
         )
     if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
-        pixels = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float()
-        pixels = F.interpolate(pixels, (IMAGE_SIZE, IMAGE_SIZE), mode="bilinear", antialias=True)
-        images = pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()
+        images = resized(images, IMAGE_SIZE)
     return np.require(images, requirements=("C", "W")), batched
 
 

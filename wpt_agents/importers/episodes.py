@@ -7,9 +7,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 
+from wpt_agents.images import resized
 from wpt_agents.trajectory import IMAGE_SIZE, Trajectory
 
 
@@ -106,13 +105,7 @@ def as_images(image: np.ndarray, size: int) -> np.ndarray:
     image = image[..., -3:]
     if image.shape[1:3] == (size, size):
         return np.ascontiguousarray(image)
-    return np.concatenate([_resized(image[at : at + 64], size) for at in range(0, len(image), 64)])
-
-
-def _resized(image: np.ndarray, size: int) -> np.ndarray:
-    pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).float()
-    pixels = F.interpolate(pixels, (size, size), mode="bilinear", antialias=True)
-    return pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
+    return np.concatenate([resized(image[at : at + 64], size) for at in range(0, len(image), 64)])
 
 
 def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:

@@ -5,6 +5,7 @@ import io
 import json
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -170,16 +171,45 @@ def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
     one = job(tmp_path, data=own)
     assert one.shared.model_path != job(tmp_path).shared.model_path
     run(one)
-    assert one.config()["data"] == str(own)
+    assert TrajectoryDataset.open(own).fingerprint.startswith(one.config()["data"])
     assert not list((tmp_path / "cache").glob("data-*"))
     path = one.shared.model_path
     assert job(tmp_path, data=own.rename(tmp_path / "moved")).shared.model_path == path
 
 
+def test_a_run_goes_on_with_the_same_data_alone(tmp_path):
+    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    run(job(tmp_path, data=own))
+    with TrajectoryDataset.open(own) as dataset:
+        dataset.append(dataset[0])
+    with pytest.raises(ValueError, match=r"other settings \(data\)"):
+        run(job(tmp_path, data=own))
+
+
+def test_the_datas_name_is_as_it_was_written_wherever_a_run_is_done(tmp_path, monkeypatch):
+    job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    monkeypatch.chdir(tmp_path)
+    one = replace(job(tmp_path, data=Path("own")), data_name="own")
+    assert replace(one, data=one.data.resolve()).label == one.label == "toy data=own"
+
+
+def test_a_failure_whose_words_look_like_markup_ends_one_run_and_not_all(
+    tmp_path, monkeypatch, capsys
+):
+    def fail(one, force):
+        raise OSError(f"could not read [/data/{one.seed}.bin]")
+
+    monkeypatch.setattr(benchmark, "run", fail)
+    assert not benchmark.run_all([job(tmp_path), job(tmp_path, seed=1)])
+    said = capsys.readouterr().out
+    assert "read [/data/0.bin]" in said and "read [/data/1.bin]" in said
+    assert "error.txt" not in said  # there is none
+
+
 def test_without_git_a_run_is_of_no_commit(monkeypatch):
     monkeypatch.setattr("shutil.which", lambda _: None)
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("asked git"))
-    assert benchmark.commit() is None
+    assert benchmark.commit.__wrapped__() is None
 
 
 def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):

@@ -119,6 +119,27 @@ def test_half_a_dataset_is_continued_to_the_same_data(tmp_path, monkeypatch):
     assert same(whole, half)
 
 
+def test_what_another_process_has_collected_meanwhile_is_not_collected_again(tmp_path, monkeypatch):
+    opened = module._open
+
+    def opened_long_before(path, told):
+        dataset = opened(path, told)
+        monkeypatch.setattr(module, "_open", opened)
+        collect(tmp_path, [DOT], 3)  # the other process, from beginning to end
+        return dataset
+
+    monkeypatch.setattr(module, "_open", opened_long_before)
+    assert len(collect(tmp_path, [DOT], 3)) == 3
+    assert TrajectoryDataset.open(tmp_path).appended == 3
+
+
+def test_more_episodes_than_were_to_be_collected_are_refused(tmp_path):
+    with collect(tmp_path, [DOT], 2) as dataset:
+        dataset.append(dataset[0])
+    with pytest.raises(ValueError, match="holds 3 episodes, more than the 2"):
+        collect(tmp_path, [DOT], 2)
+
+
 def test_a_finished_dataset_is_returned_without_playing(tmp_path, monkeypatch):
     collect(tmp_path / "data", [DOT], 2, workers=1, progress_bar=False)
     monkeypatch.setattr(module, "play", lambda job: pytest.fail("played again"))

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
 from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
@@ -75,6 +76,19 @@ def test_a_real_run_on_an_engine_leaves_the_same_folder(tmp_path, monkeypatch):
     assert "evaluate" in (one.folder / "log.txt").read_text()
     assert (one.folder / "command.txt").read_text().strip() == one.command
     assert standing(one).state == "finished"
+
+
+def test_force_deletes_nothing_unless_it_can_begin(jobs):
+    for one in jobs:
+        one.folder.mkdir(parents=True)
+        (one.folder / "config.yaml").write_text(yaml.safe_dump(one.config()))
+        (one.folder / "result.json").write_text("{}")
+    with (
+        stages.locked(jobs[1].folder / "lock"),
+        pytest.raises(ValueError, match="worked on by another process"),
+    ):
+        run_on("local", jobs, True, Resources())
+    assert (jobs[0].folder / "result.json").exists()
 
 
 def test_an_unknown_engine_is_answered_with_the_nearest(tmp_path):

@@ -10,8 +10,9 @@ import pytest
 from run_folders import make_run
 
 from wpt_agents.zoo.plan import METHODS
-from wpt_agents.zoo.report import aggregates, figures
+from wpt_agents.zoo.report import aggregates, figures, sections
 from wpt_agents.zoo.report.aggregates import misprint, references
+from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.report.sections import shared_about
 
@@ -208,3 +209,27 @@ def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
         assert page.count(f"{variable[4:-1]}: #") == 2
     template = Path(figures.__file__).with_name("page.html.jinja").read_text()
     assert f"% {len(figures.SERIES)} + 1" in template  # the key's
+
+
+def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart():
+    high, low, wide, single = [9, 10, 11], [1, 2, 3], [0, 2, 10], [1]
+    assert sections.above(high, low) and not sections.above(low, high)
+    assert not sections.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
+    assert not sections.above(high, single) and not sections.above(single, low)
+
+
+def test_the_headline_compares_successes_where_they_are_the_score(tmp_path):
+    for seed in range(3):  # 4.9 and less is no success
+        make_run(tmp_path, "metaworld-reach", seed, "wpt", (4.9 - seed / 100, 4.9))
+        make_run(tmp_path, "metaworld-reach", seed, "scratch", (0.0, 5.1 + seed / 100))
+    [told] = sections.headline(read_results(tmp_path))
+    against = {each["name"]: (each["above"], each["below"]) for each in told["against"]}
+    assert against == {"random policy": (0, 0), "prior actor": (0, 0), "same, from scratch": (0, 1)}
+
+
+def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
+    make_run(tmp_path / "a", "metaworld-reach", returns=(9.0, 1.0))
+    make_run(tmp_path / "b", "dmc-walker-run", returns=(100.0, 100.0), frames=1000)
+    make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
+    [told] = sections.both_suites(read_results(tmp_path))
+    assert told["ours"] == pytest.approx((0.5 + 0.1) / 2)

@@ -55,6 +55,32 @@ def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
     assert told[3:] == ["prior actor", "kickstart"]  # the same clone as wpt's
 
 
+def test_untrained_policies_are_told_apart_by_how_they_are_played(tmp_path):
+    for preset in ("demo", "debug", "demo size=tiny", "demo evaluate.episodes=3"):
+        make_run(tmp_path, "dmc-walker-run", method="scratch", preset=preset)
+    lines = [each.preset for each in lines_of(tmp_path) if each.method == "random"]
+    assert lines == ["debug", "demo", "demo evaluate.episodes=3"]
+
+
+def test_budgets_are_kept_apart_where_there_is_no_run_of_wpt():
+    lines = [line("scratch", 10.0, frames=100), line("scratch", 90.0, frames=300)]
+    lines += [line("scratch", 50.0, frames=900, preset="small"), line("random", 1.0, frames=0)]
+    means = record.by_suite(lines)
+    found = {method: cell.mean for method, suites in means.items() for _, cell in suites.values()}
+    assert found == {
+        **{"random": 1.0, "scratch": 10.0, "scratch, 3x frames": 90.0},
+        "scratch, 9x frames, small": 50.0,
+    }
+
+
+def test_a_record_of_another_suffix_is_refused_before_anything_is_written(tmp_path):
+    make_run(tmp_path / "runs", "dmc-walker-run")
+    for name in ("record.md", "record.png", "record"):
+        words = ["report", str(tmp_path / "runs"), "--record", str(tmp_path / name)]
+        assert "a record is a .csv" in str(CliRunner().invoke(app, words).exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
 def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     path = tmp_path / "small.csv"
     first = [line("wpt", 1.5), line("wpt", 2.0, seed=1)]

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from run_folders import make_run
 
-from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.report.aggregates import estimate
-from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.statistics import (
     bootstrap,
     iqm,
@@ -129,18 +126,3 @@ def test_the_profile_and_its_band_are_rliables():
     low, high = bootstrap(profile, list(RUNS.T))
     assert low == pytest.approx([0.7, 0.2, 0], abs=0.01)
     assert high == pytest.approx([1, 0.6, 0], abs=0.01)
-
-
-def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart(tmp_path):
-    def row(name, *means):
-        for seed, value in enumerate(means):
-            make_run(tmp_path / name, "dmc-dot", seed, returns=(value, value))
-        rows = tables.policies(read_results(tmp_path / name))
-        return next(r for r in rows if (r.method, r.policy) == ("wpt", "WPT"))
-
-    high, low, wide, single = (
-        row(*given) for given in (("a", 9, 10, 11), ("b", 1, 2, 3), ("c", 0, 2, 10), ("d", 1))
-    )
-    assert tables.above(high, low) and not tables.above(low, high)
-    assert not tables.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
-    assert not tables.above(high, single) and not tables.above(single, low)

@@ -188,6 +188,13 @@ class TrajectoryDataset(Conversions):
             other._entries.append(writer.copy(blocks, entry))
             other._windows = None
 
+    def reserve(self) -> None:
+        """Takes the right to write now, not at the first append; what others appended is seen.
+
+        :raises ValueError: another writer is at work; a subset
+        """
+        self._begin()
+
     def _begin(self) -> Writer:
         """The right to write, taken at the first append; what others appended is seen then."""
         if self.is_subset:

@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from rich.markup import escape
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -63,11 +65,13 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
         try:
             done = run(job, force)
         except Exception as error:  # whatever one run dies of, the others are not to blame
-            console.print(f"[red]failed[/red]: {error}\nTraceback: {job.folder / 'error.txt'}")
+            console.print(f"[red]failed[/red]: {escape(str(error))}")
+            if (trace := job.folder / "error.txt").exists():
+                console.print(f"Traceback: {escape(str(trace))}")
             continue
         console.print(tables.scores_table(done))
         say("took", ", ".join(f"{k} {v:.0f} s" for k, v in done["seconds"].items()))
-        console.print(f"Run folder: [bold]{job.folder.resolve()}[/bold]")
+        console.print(f"Run folder: [bold]{escape(str(job.folder.resolve()))}[/bold]")
     results = [result for job in jobs if (result := job.result())]
     if len(results) > 1:
         console.print(tables.summary_table(tables.summarise(results)))
@@ -88,7 +92,8 @@ def run(job: Run, force: bool = False) -> dict[str, Any]:
 
 
 def clear(folder: Path) -> None:
-    """Deletes what a run has left, all but its lock."""
+    """Deletes what a run has left, all but its lock; first what says that it is finished."""
+    (folder / "result.json").unlink(missing_ok=True)
     for path in folder.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
@@ -113,7 +118,7 @@ def _begin(job: Run) -> dict[str, Any]:
 def check_folder(job: Run, force: bool) -> None:
     """Refuses to take a folder that is not this run's."""
     path = job.folder / "config.yaml"
-    others = {each.name for each in job.folder.glob("*")} - {"lock", "log.txt"}
+    others = {each.name for each in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
@@ -327,8 +332,12 @@ def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) ->
     }
 
 
+@cache
 def commit() -> str | None:
-    """The checkout's commit, '+' behind it when files differ; None outside a checkout."""
+    """The checkout's commit, '+' behind it when files differ; None outside a checkout.
+
+    Asked once, when the first run begins: the code that is at work does not change after that.
+    """
     root = Path(__file__).parents[2]
     if shutil.which("git") is None or not (root / ".git").exists():
         return None

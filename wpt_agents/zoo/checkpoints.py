@@ -214,6 +214,7 @@ class ContinuedCSV(CSVOutputFormat):
         before = path.read_text() if path.exists() else ""
         super().__init__(str(path))
         self.file.write(before)
+        self.file.flush()
         self.keys = before.partition("\n")[0].split(",") if before else []
 
     def keep(self, rows: int) -> None:

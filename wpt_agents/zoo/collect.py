@@ -184,15 +184,21 @@ def collect(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
     told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
-    dataset = _open(Path(path), told)
-    total, before = len(tasks) * episodes, dataset.appended
-    label, hide = f"collect {behaviour}", not progress_bar or before == total
-    bar = progress(total, label, "episodes", before, hide)
-    with bar, dataset:
-        if behaviour in EXPLORERS:
-            _collect_curious(dataset, tasks, episodes, plan, workers, bar)
-        else:
-            _collect_played(dataset, tasks, episodes, plan, workers, bar)
+    dataset, total = _open(Path(path), told), len(tasks) * episodes
+    if dataset.appended > total:
+        raise ValueError(
+            f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
+            "two processes have collected into it at once; delete it and collect again"
+        )
+    if dataset.appended == total:
+        return dataset
+    label, gather = f"collect {behaviour}", _collect_played
+    if behaviour in EXPLORERS:
+        gather = _collect_curious
+    with dataset:
+        dataset.reserve()  # before what is missing is counted
+        with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
+            gather(dataset, tasks, episodes, plan, workers, bar)
     return TrajectoryDataset.open(path)
 
 

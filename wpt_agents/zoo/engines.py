@@ -10,7 +10,7 @@ import signal
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.markup import escape
 
 from wpt_agents.names import counted
 from wpt_agents.zoo import benchmark
@@ -62,8 +63,10 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     runners: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
     runner = runners[engine](given)
     left = [job for job in jobs if force or job.result() is None]
-    for job in left if force else ():
-        with locked(job.folder / "lock"):
+    with ExitStack() as held:
+        for job in left if force else ():  # all of them, before anything is deleted
+            held.enter_context(locked(job.folder / "lock"))
+        for job in left if force else ():
             benchmark.clear(job.folder)
     by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
     shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
@@ -75,7 +78,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
             raise ValueError(f"What the runs share could not be made: {reason}")
         errors = runner.map(do, left, tick)
     for folder, error in errors.items():
-        console.print(f"[red]failed[/red] {folder}: {error}")
+        console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")
     return all(job.result() for job in jobs)
 
 

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from wpt_envs.rendering import QUALITIES
 from wpt_envs.tasks import Task
 
 from wpt_agents.checks import check_hyperparameters
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.guidance import ever, parse_schedule
 from wpt_agents.names import counted, unknown_name
+from wpt_agents.zoo.collect import BEHAVIOURS
 from wpt_agents.zoo.presets import Preset, load_preset, wpt_keywords
 from wpt_agents.zoo.stages import Shared, console
 from wpt_agents.zoo.tasks import find_tasks, short_name
@@ -64,6 +66,7 @@ class Run:
     """One run, fully told before it begins.
 
     :param changes: of the preset, each "key=value"
+    :param data_name: how the data's folder was written; `data` itself may be made absolute
     :param command: what the user typed, whichever process does the run
     """
 
@@ -77,6 +80,7 @@ class Run:
     device: str = "auto"
     data: Path | None = None
     changes: tuple[str, ...] = ()
+    data_name: str = ""
     command: str = field(default_factory=this_command, compare=False)
 
     def __post_init__(self) -> None:
@@ -87,7 +91,7 @@ class Run:
     def label(self) -> str:
         """The preset's name and what was changed of it, but for `frames`, which stand apart."""
         changes = [c for c in self.changes if not c.startswith("learn.frames=")]
-        own_data = [f"data={self.data}"] if self.data is not None else []
+        own_data = [f"data={self.data_name or self.data}"] if self.data is not None else []
         return shlex.join([self.preset_name, *sorted(changes), *own_data])
 
     @property
@@ -136,10 +140,15 @@ class Run:
             **about,
             "seed": self.seed,
             "preset": self.preset_name,
-            **({"data": str(self.data.resolve())} if self.data is not None else {}),
+            **({"data": self._data_fingerprint()} if self.data is not None else {}),
             **self.preset.as_dict(),
             "wpt": self.wpt,
         }
+
+    def _data_fingerprint(self) -> str:
+        """Which trajectories the data are, wherever they lie."""
+        assert self.data is not None
+        return TrajectoryDataset.open(self.data).fingerprint[:16]
 
     def result(self) -> dict[str, Any] | None:
         """What `result.json` holds, None while the run is not finished."""
@@ -180,19 +189,43 @@ def make_plan(
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
     check_hyperparameters({**wpt_keywords(), **resolved.wpt})
+    for name, value, known in (
+        ("env.rendering", resolved.env.rendering, QUALITIES),
+        ("collect.behaviour", resolved.collect.behaviour, set(BEHAVIOURS) - {"policy"}),
+    ):
+        if value not in known:
+            raise unknown_name(name, value, known)
     collected = find_tasks(suite, resolved.collect.tasks)
     widths = {row.action_dim for row in collected}
     if data is not None:
         widths = set(TrajectoryDataset.open(data).action_dims)
+    changes = tuple({setting.partition("=")[0]: setting for setting in settings}.values())
+    for method in dict.fromkeys(methods):
+        check_changes(method, changes)
+    fixed = preset, resolved, out, workers, device, data, changes, str(data or "")
     jobs = [
-        Run(row, seed, method, preset, resolved, out, workers, device, data, tuple(settings))
+        Run(row, seed, method, *fixed)
         for row in rows
-        for method in methods
+        for method in dict.fromkeys(methods)
         for seed in parse_seeds(seeds)
     ]
     for job in jobs:
         check_width(job, widths)
     return jobs
+
+
+def check_changes(method: str, changes: Sequence[str]) -> None:
+    """Refuses a setting that the method itself sets, and so would overrule."""
+    if method not in METHODS:
+        raise unknown_name("method", method, METHODS)
+    for change in changes:
+        name, _, value = change.partition("=")
+        if name.removeprefix("wpt.") in (own := METHODS[method].wpt):
+            own_value = own[name.removeprefix("wpt.")]
+            raise ValueError(
+                f"--method {method} means {name}={own_value}, so --set {name}={value} would have "
+                "no effect: leave it out, or take --method wpt"
+            )
 
 
 def check_width(job: Run, widths: Collection[int]) -> None:

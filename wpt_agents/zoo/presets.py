@@ -116,11 +116,20 @@ class Preset:
     wpt: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if min(self.env.action_repeat, self.evaluate.episodes) < 1 or self.steps < 1:
+        counts = {
+            "env.action_repeat": self.env.action_repeat,
+            "collect.episodes": self.collect.episodes,
+            "pretrain.steps": self.pretrain.steps,
+            "evaluate.episodes": self.evaluate.episodes,
+            "evaluate.during_episodes": self.evaluate.during_episodes,
+        }
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}.")
+        if self.steps < 1:
             raise ValueError(
-                "env.action_repeat, evaluate.episodes and learn.frames / env.action_repeat must be "
-                f"at least 1, got {self.env.action_repeat}, {self.evaluate.episodes} and "
-                f"{self.learn.frames} frames."
+                "learn.frames / env.action_repeat must be at least 1, got "
+                f"{self.learn.frames} / {self.env.action_repeat}."
             )
         for key in self.wpt:
             if key not in wpt_keywords():

@@ -151,6 +151,10 @@ class Shared:
             say("collect", f"given, {counted(len(dataset), 'episode')}  [dim]{self.data_path}")
             self._say_what_differs()
             return dataset
+        with locked(self.cache / f"lock-{self.data_path.name}", wait=True):
+            return self._collected()
+
+    def _collected(self) -> TrajectoryDataset:
         wanted, given = len(self.tasks) * self.preset.collect.episodes, self.preset.collect
         try:
             there = self.data_path.exists()

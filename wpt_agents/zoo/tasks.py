@@ -30,7 +30,10 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
             s for s in suites if any(t.name == name for t in table.suite(s, paper_only=False))
         ]
         if not matching and elsewhere:
-            raise ValueError(f"{name} is of the suite {elsewhere[0]}: --suite {elsewhere[0]}")
+            raise ValueError(
+                f"{name} is of the suite {elsewhere[0]}: write {elsewhere[0]}-{name}, or --suite "
+                f"{elsewhere[0]} where there is such an option"
+            )
         if not matching:
             raise unknown_name(f"task in suite {where!r} called", name, rows)
         found |= matching

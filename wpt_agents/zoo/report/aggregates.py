@@ -72,9 +72,9 @@ def references() -> tuple[Reference, ...]:
     return tuple(found)
 
 
-def score_of(result: Mapping[str, Any]) -> float:
+def score_of(result: Mapping[str, Any], policy: str = "WPT") -> float:
     """What a run counts for: WPT's success rate if the task counts successes, else its return."""
-    score = result["scores"]["WPT"]
+    score = result["scores"][policy]
     return score["success_rate"] if result["metric"] == "success" else score["mean"]
 
 

@@ -37,6 +37,8 @@ def report(
     from wpt_agents.zoo.report.page import write_page
     from wpt_agents.zoo.stages import console
 
+    if record is not None and record.suffix != ".csv":
+        raise ValueError(f"--record {record}: a record is a .csv; its .md and .png stand beside it")
     results = read_results(folder)
     if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")

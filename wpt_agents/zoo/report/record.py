@@ -84,7 +84,7 @@ def _lines(result: Mapping[str, Any]) -> Iterator[Line]:
             result["task"],
             _method(policy, result["method"]),
             result["seed"],
-            "" if policy in UNTRAINED else result["preset"],
+            played(result["preset"]) if policy in UNTRAINED else result["preset"],
             0 if policy in UNTRAINED else result["frames"],
             round(100 * (score["mean"] / BEST_RETURN if success is None else success), 2),
             round(score["mean"], 2),
@@ -93,6 +93,12 @@ def _lines(result: Mapping[str, Any]) -> Iterator[Line]:
             result.get("commit") or "unknown",
             command(result),
         )
+
+
+def played(preset: str) -> str:
+    """What of a preset's name tells how policies are played that learn nothing."""
+    name, *changes = shlex.split(preset)
+    return shlex.join([name, *(c for c in changes if c.startswith(("env.", "evaluate.")))])
 
 
 def _method(policy: str, method: str) -> str:
@@ -200,16 +206,20 @@ def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, tuple[int, Cell]]]:
     where wpt has several presets or budgets, its least one is taken, and the others bear them too.
     """
     usual: dict[str, tuple[int, str]] = {}
-    for line in lines:
-        if line.method == "wpt":
-            here = line.frames, line.preset
-            usual[line.suite] = min(usual.get(line.suite, here), here)
+    for of_wpt in (True, False):  # others count where a suite has none of it
+        least: dict[str, tuple[int, str]] = {}
+        for line in lines:
+            if line.frames and (line.method == "wpt") == of_wpt:
+                here = line.frames, line.preset
+                least[line.suite] = min(least.get(line.suite, here), here)
+        usual = least | usual
     groups: dict[str, dict[str, dict[str, list[float]]]] = {}
     for line in lines:
-        frames, preset = usual.get(line.suite, (line.frames or 1, line.preset))
+        frames, preset = usual.get(line.suite, (1, line.preset))
         ratio = line.frames / frames
         name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
-        name += f", {line.preset}" if line.preset not in ("", preset) else ""
+        alike = preset if line.frames else played(preset)
+        name += f", {line.preset}" if line.preset not in ("", alike) else ""
         suites = groups.setdefault(name, {})
         suites.setdefault(line.suite, defaultdict(list))[line.task].append(line.score)
     return {method: _means(groups[method]) for method in sorted(groups, key=_place)}

@@ -10,9 +10,15 @@ from wpt_envs.tasks import TASKS
 
 from wpt_agents.zoo.plan import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
-from wpt_agents.zoo.report.aggregates import STATISTICS, Estimate, Experiment, Reference
+from wpt_agents.zoo.report.aggregates import (
+    STATISTICS,
+    Estimate,
+    Experiment,
+    Reference,
+    score_of,
+)
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.tables import above, interval_text, policies
+from wpt_agents.zoo.report.tables import POLICIES, interval_text
 from wpt_agents.zoo.statistics import (
     bootstrap,
     mean,
@@ -49,10 +55,13 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Tasks with a single seed have no interval and do not count; `against` is empty if all are such.
     """
-    tables: dict[tuple[str, str, int], dict[str, dict[tuple[str, str], Any]]] = {}
-    for row in policies(results):
-        about = row.task.split("-")[0], row.preset, row.frames
-        tables.setdefault(about, {}).setdefault(row.task, {})[row.method, row.policy] = row
+    tables: dict[tuple[str, str, int], dict[str, dict[tuple[str, str], dict[int, float]]]] = {}
+    for result in results:
+        about = result["suite"], result["preset"], result["frames"]
+        task = tables.setdefault(about, {}).setdefault(result["task"], {})
+        for policy in result["scores"]:
+            whose = "" if policy in POLICIES else result["method"]
+            task.setdefault((whose, policy), {})[result["seed"]] = score_of(result, policy)
     others = {"random policy": ("", "random"), "prior actor": ("wpt", "prior actor")}
     others |= {"same, from scratch": ("scratch", "WPT")}
     told = []
@@ -60,11 +69,11 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         against = []
         for name, other in others.items():
             pairs = [
-                (t["wpt", "WPT"], t[other])
+                (list(t["wpt", "WPT"].values()), list(t[other].values()))
                 for t in tasks.values()
                 if {("wpt", "WPT"), other} <= t.keys()
             ]
-            pairs = [pair for pair in pairs if all(row.t_low is not None for row in pair)]
+            pairs = [pair for pair in pairs if min(map(len, pair)) > 1]
             if pairs:
                 higher = sum(above(ours, theirs) for ours, theirs in pairs)
                 lower = sum(above(theirs, ours) for ours, theirs in pairs)
@@ -76,10 +85,17 @@ def headline(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return told
 
 
+def above(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether one's interval over seeds, by Student's t, lies above the other's."""
+    (_, low, _), (_, _, high) = mean_interval(one), mean_interval(other)
+    return low is not None and high is not None and low > high
+
+
 def both_suites(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The paper's aggregate, for each preset and method that has runs of both of its suites."""
     found: dict[tuple[str, str], dict[str, Scores]] = defaultdict(dict)
-    for one, tasks in aggregates.by_experiment(results).items():
+    every = aggregates.by_experiment(results).items()
+    for one, tasks in sorted(every, key=lambda item: -item[0].frames):  # the least budget stays
         found[one.method, one.preset][one.suite] = tasks
     told = []
     for (method, preset), suites in found.items():

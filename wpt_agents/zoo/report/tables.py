@@ -109,11 +109,6 @@ class PolicyRow:
         )
 
 
-def above(one: PolicyRow, other: PolicyRow) -> bool:
-    """Whether one's interval over seeds lies above the other's; one seed has none and says no."""
-    return one.t_low is not None and other.t_high is not None and one.t_low > other.t_high
-
-
 def policies(results: Iterable[Mapping[str, Any]]) -> list[PolicyRow]:
     """One row for each task, preset, budget and policy; the untrained policies come first."""
     groups: dict[tuple[str, str, int, str, str], dict[int, Mapping[str, Any]]] = defaultdict(dict)

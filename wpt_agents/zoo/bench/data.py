@@ -24,6 +24,7 @@ from wpt_agents.trajectory import Trajectory
 from wpt_agents.windows import Windows
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.formats import FORMATS, Read, store
+from wpt_agents.zoo.bench.timing import memory_mib
 from wpt_agents.zoo.collect import collect
 
 Rows = Iterator[dict[str, Any]]
@@ -194,7 +195,7 @@ def make_store(path: Path, count: int, copies: int) -> None:
 
 def use_store(path: Path, workers: int, draws: int = 50) -> dict[str, Any]:
     """Opens a store and samples: seconds, windows a second, and resident memory above before."""
-    before = _memory("VmRSS")
+    before = memory_mib("VmRSS")
     began = time.process_time()
     dataset = TrajectoryDataset.open(path, workers)
     opening = time.process_time() - began
@@ -210,14 +211,5 @@ def use_store(path: Path, workers: int, draws: int = 50) -> dict[str, Any]:
         "gb": round(info["bytes"] / 1e9, 2),
         "open_s": round(opening, 2),
         "windows_per_s": round(BATCH[0] / seconds),
-        "resident_mib": round(_memory("VmHWM") - before) if before else None,
+        "resident_mib": round(memory_mib("VmHWM") - before) if before else None,
     }
-
-
-def _memory(field: str) -> float:
-    """A figure of this process in MiB: VmRSS, resident now, or VmHWM, the most so far."""
-    status = Path("/proc/self/status")
-    if not status.exists():  # not Linux
-        return 0.0
-    lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
-    return int(lines[field].split()[0]) / 1024

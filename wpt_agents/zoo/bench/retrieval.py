@@ -4,7 +4,6 @@ Queries are the first images of fresh episodes, as in fine-tuning; the search is
 robot's name nor its action width. Data and model are kept in `runs/bench/retrieval`.
 """
 
-import resource
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -20,6 +19,7 @@ from wpt_envs.tasks import TASKS
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.retrieval import Retriever
 from wpt_agents.wpt import WPT
+from wpt_agents.zoo.bench.timing import memory_mib
 from wpt_agents.zoo.collect import collect
 
 FOLDER = Path("runs") / "bench" / "retrieval"
@@ -125,7 +125,7 @@ def index_cost(trajectories: int, width: int) -> dict[str, Any]:
 
 
 def _index_cost(trajectories: int, width: int) -> dict[str, Any]:
-    rng, before = np.random.default_rng(0), _peak()
+    rng, before = np.random.default_rng(0), memory_mib("VmHWM")
 
     def embed(image: np.ndarray) -> np.ndarray:
         return rng.standard_normal((len(image), width), np.float32)
@@ -140,10 +140,6 @@ def _index_cost(trajectories: int, width: int) -> dict[str, Any]:
         "features": f"index of {trajectories:,} x {width:,}",
         "cpu seconds to build": round(built - start, 1),
         "cpu seconds a search": round((searched - built) / 10, 3),
-        "peak MiB": round(_peak()),
+        "peak MiB": round(memory_mib("VmHWM")),
         "of which imports": round(before),
     }
-
-
-def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -134,3 +134,12 @@ def resident_mb() -> float:
     if not statm.exists():
         return float("nan")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def memory_mib(field: str) -> float:
+    """A figure of this process in MiB: VmRSS, resident now, or VmHWM, the most so far."""
+    status = Path("/proc/self/status")
+    if not status.exists():  # not Linux
+        return 0.0
+    lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
+    return int(lines[field].split()[0]) / 1024

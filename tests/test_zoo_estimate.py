@@ -35,12 +35,19 @@ def test_no_room_is_told_before_any_work(tmp_path, monkeypatch, capsys):
 
 def test_hours_come_from_finished_runs_of_the_preset(tmp_path):
     jobs = [job(tmp_path, seed=seed) for seed in range(2)]
-    assert hours_needed(jobs, tmp_path) is None
+    assert hours_needed(jobs, jobs[0]) is None
     assert "time unknown until" in summary(jobs)
     make_run(tmp_path, "dmc-walker-run", preset="toy", frames=1000)  # 2 seconds
-    assert hours_needed(jobs, tmp_path) == pytest.approx(2 / 1000 * 150 / 3600)
+    assert hours_needed(jobs, jobs[0]) == pytest.approx(2 / 1000 * 150 / 3600)
     other = [replace(one, preset_name="other") for one in jobs]
-    assert hours_needed(other, tmp_path) is None
+    assert hours_needed(other, other[0]) is None
+
+
+def test_what_force_makes_anew_is_counted(tmp_path):
+    jobs = [job(tmp_path, seed=seed) for seed in range(2)]
+    assert make_run(tmp_path, "dmc-dot", preset="toy", frames=75) == jobs[0].folder
+    assert summary(jobs).startswith("1 of 2 runs to do")
+    assert summary(jobs, force=True).startswith("2 of 2 runs to do")
 
 
 @pytest.mark.parametrize(("size", "text"), [(5e6, "5 MB"), (2.54e9, "2.5 GB")])

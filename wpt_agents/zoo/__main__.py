@@ -169,7 +169,7 @@ def run_benchmark(
         return
     if dry_run:
         show_plan(jobs, force)
-        typer.echo(summary(jobs))
+        typer.echo(summary(jobs, force))
     check_machine(engine, device)
     check_space(jobs)
     for job in jobs:

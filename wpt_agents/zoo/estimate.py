@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -46,14 +45,14 @@ def check_space(jobs: Sequence[Run]) -> None:
         )
 
 
-def hours_needed(jobs: Sequence[Run], out: Path) -> float | None:
-    """Hours for the runs to be done, from finished ones of the preset; None if there are none."""
-    preset = jobs[0].preset_name
+def hours_needed(left: Sequence[Run], like: Run) -> float | None:
+    """Hours for the runs `left`, from finished ones of a run's preset; None if there are none."""
+    folder = like.out / like.preset_name
     paces = [
         sum(result["seconds"].values()) / result["frames"]
-        for result in (read_results(out / preset) if (out / preset).exists() else [])
+        for result in (read_results(folder) if folder.exists() else [])
     ]
-    frames = sum(job.preset.learn.frames for job in jobs if job.result() is None)
+    frames = sum(job.preset.learn.frames for job in left)
     return float(np.mean(paces)) * frames / 3600 if paces else None
 
 
@@ -62,17 +61,17 @@ def gigabytes(size: int) -> str:
     return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.0f} MB"
 
 
-def summary(jobs: Sequence[Run]) -> str:
-    """One line for the end of a plan."""
-    left = sum(job.result() is None for job in jobs)
-    hours = hours_needed(jobs, jobs[0].out)
+def summary(jobs: Sequence[Run], force: bool = False) -> str:
+    """One line for the end of a plan; with `force` finished runs are to do, too."""
+    left = [job for job in jobs if force or job.result() is None]
+    hours = hours_needed(left, jobs[0])
     time = (
         "time unknown until one of this preset is finished"
         if hours is None
         else f"{hours:.1f} hours"
     )
-    updates = sum(job.updates for job in jobs if job.result() is None)
+    updates = sum(job.updates for job in left)
     return (
-        f"{left} of {counted(len(jobs), 'run')} to do, {counted(updates, 'update')}; "
+        f"{len(left)} of {counted(len(jobs), 'run')} to do, {counted(updates, 'update')}; "
         f"one after the other: {time}; disk: about {gigabytes(disk_needed(jobs))}"
     )

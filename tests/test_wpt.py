@@ -521,14 +521,10 @@ def test_the_forward_passes_can_run_in_bfloat16(store):
 def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_reward(monkeypatch):
     model, episode = agent(ClockEnv()), recorded(length=6)
     episode = replace(episode, reward=np.arange(6, dtype=np.float32))
-    grey, three = (
-        (lambda state: torch.zeros(1, 7, 64, 64, 3)),
-        (lambda feat: torch.full((1, 7), 3.0)),
-    )
-    monkeypatch.setattr(
-        model.policy.world_model, "decode", grey
-    )  # 0 is the middle of black and white
-    monkeypatch.setattr(model.policy.world_model, "reward", three)
+    world_model = model.policy.world_model
+    grey, three = torch.zeros(7, 64, 64, 3), torch.full((1, 7), 3.0)  # 0: between black and white
+    monkeypatch.setattr(world_model.decoder, "images", lambda code: grey)
+    monkeypatch.setattr(world_model, "reward", lambda feat: three)
     errors = model.policy.heldout_errors(episode)
     by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()
     assert errors["reconstruction"] == pytest.approx(by_hand, rel=1e-4)

@@ -38,6 +38,9 @@ def push(folder: Path, name: str, private: bool = False) -> str:
         for file in FILES:
             if (folder / file).exists():
                 shutil.copy2(folder / file, Path(aside) / file)
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config.pop("data", None)  # in older runs a path on their machine
+        (Path(aside) / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         if (folder / "policy.mp4").exists():
             shutil.copy2(folder / "policy.mp4", Path(aside) / VIDEO)
         (Path(aside) / "README.md").write_text(card(folder, name))

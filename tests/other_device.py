@@ -10,6 +10,7 @@ from functools import partial
 
 import pytest
 import torch
+from torch import library
 from torch.utils import backend_registration
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -90,7 +91,6 @@ def copied(source, target, non_blocking=False):
 
 # When it is imported, as autograd's first way back, of whatever test, counts the devices there are.
 backend_registration._setup_privateuseone_for_python_backend("other", Backend())
-kernels = torch.library.Library("aten", "IMPL")  # which last as long as it
 for maker in aten.empty.memory_format, aten.empty_strided.default:
-    kernels.impl(maker, partial(made, maker), "PrivateUse1")
-kernels.impl(aten._copy_from.default, copied, "PrivateUse1")  # for `torch.tensor`
+    library.impl(maker.name(), "other", partial(made, maker))
+library.impl(aten._copy_from.default.name(), "other", copied)  # for `torch.tensor`

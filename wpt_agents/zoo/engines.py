@@ -63,11 +63,12 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     runners: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
     runner = runners[engine](given)
     left = [job for job in jobs if force or job.result() is None]
+    anew = [job.folder for job in left] if force else []
     with ExitStack() as held:
-        for job in left if force else ():  # all of them, before anything is deleted
-            held.enter_context(locked(job.folder / "lock"))
-        for job in left if force else ():
-            benchmark.clear(job.folder)
+        for folder in anew:  # all of them, before anything is deleted
+            held.enter_context(locked(folder / "lock"))
+        for folder in anew:
+            benchmark.clear(folder)
     by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
     shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
     runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")

@@ -140,15 +140,10 @@ class Run:
             **about,
             "seed": self.seed,
             "preset": self.preset_name,
-            **({"data": self._data_fingerprint()} if self.data is not None else {}),
+            **({"data": self.shared.data_source} if self.data is not None else {}),
             **self.preset.as_dict(),
             "wpt": self.wpt,
         }
-
-    def _data_fingerprint(self) -> str:
-        """Which trajectories the data are, wherever they lie."""
-        assert self.data is not None
-        return TrajectoryDataset.open(self.data).fingerprint[:16]
 
     def result(self) -> dict[str, Any] | None:
         """What `result.json` holds, None while the run is not finished."""

@@ -205,21 +205,18 @@ def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, tuple[int, Cell]]]:
     A method with another budget than wpt's on the suite bears it in its name: "scratch, 3x frames";
     where wpt has several presets or budgets, its least one is taken, and the others bear them too.
     """
-    usual: dict[str, tuple[int, str]] = {}
-    for of_wpt in (True, False):  # others count where a suite has none of it
-        least: dict[str, tuple[int, str]] = {}
-        for line in lines:
-            if line.frames and (line.method == "wpt") == of_wpt:
-                here = line.frames, line.preset
-                least[line.suite] = min(least.get(line.suite, here), here)
-        usual = least | usual
+    usual: dict[str, tuple[bool, int, str]] = {}
+    for line in lines:
+        if line.frames:  # others than wpt's count where a suite has none
+            here = line.method != "wpt", line.frames, line.preset
+            usual[line.suite] = min(usual.get(line.suite, here), here)
     groups: dict[str, dict[str, dict[str, list[float]]]] = {}
     for line in lines:
-        frames, preset = usual.get(line.suite, (1, line.preset))
+        _, frames, preset = usual.get(line.suite, (True, 1, line.preset))
         ratio = line.frames / frames
         name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
         alike = preset if line.frames else played(preset)
-        name += f", {line.preset}" if line.preset not in ("", alike) else ""
+        name += f", {line.preset}" if line.preset != alike else ""
         suites = groups.setdefault(name, {})
         suites.setdefault(line.suite, defaultdict(list))[line.task].append(line.score)
     return {method: _means(groups[method]) for method in sorted(groups, key=_place)}

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.names import counted
@@ -188,7 +189,7 @@ def summary_table(rows: Sequence[Row]) -> Table:
         words = heading in ("task", "method", "preset")
         table.add_column(heading, justify="left" if words else "right")
     for row in rows:
-        table.add_row(*cells(row))
+        table.add_row(*map(escape, cells(row)))  # a preset's name may hold brackets
     return table
 
 

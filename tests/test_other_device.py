@@ -99,7 +99,7 @@ def test_another_device_promises_what_the_cpu_promises(other):
 
 
 def test_an_update_waits_for_the_device_once_a_network(other):
-    model = agent(device=other, kickstart=1.0)
+    model = agent(device=other, kickstart=1.0, return_norm=False)
     model.cloned = True
     model.replay_buffer.add(recorded())
     model.update(defaultdict(list))

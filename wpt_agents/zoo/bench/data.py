@@ -211,5 +211,5 @@ def use_store(path: Path, workers: int, draws: int = 50) -> dict[str, Any]:
         "gb": round(info["bytes"] / 1e9, 2),
         "open_s": round(opening, 2),
         "windows_per_s": round(BATCH[0] / seconds),
-        "resident_mib": round(memory_mib("VmHWM") - before) if before else None,
+        "resident_mib": round(memory_mib("VmHWM") - before, 0),
     }

@@ -7,7 +7,7 @@ import numpy as np
 
 from wpt_agents.replay import ReplayBuffer
 from wpt_agents.trajectory import Trajectory
-from wpt_agents.zoo.bench.timing import resident_mb, seconds
+from wpt_agents.zoo.bench.timing import memory_mib, seconds
 
 LENGTH, ACTIONS = 500, 6
 
@@ -15,9 +15,9 @@ LENGTH, ACTIONS = 500, 6
 def rows(quick: bool = False) -> Iterator[dict]:
     """One row a number of stored images: what they alone take, and what the process grew by."""
     for frames in (2_000,) if quick else (100_000, 10_000):
-        before = resident_mb()
+        before = memory_mib("VmRSS")
         replay = filled(frames)
-        held = resident_mb() - before
+        held = memory_mib("VmRSS") - before
         sample = partial(replay.sample, 16, 64, ACTIONS, np.random.default_rng(0))
         processor, wall = seconds(sample, 3 if quick else 100, warmup=3)
         yield {
@@ -30,7 +30,7 @@ def rows(quick: bool = False) -> Iterator[dict]:
             "wall_s": wall,
             "image_mb": sum(t.image.nbytes for t in replay.trajectories) / 2**20,
             "held_mb": held,
-            "rss_mb": resident_mb(),
+            "rss_mb": memory_mib("VmRSS"),
         }
         del replay, sample  # or the next case would begin with its memory
 

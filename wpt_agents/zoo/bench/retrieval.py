@@ -140,6 +140,6 @@ def _index_cost(trajectories: int, width: int) -> dict[str, Any]:
         "features": f"index of {trajectories:,} x {width:,}",
         "cpu seconds to build": round(built - start, 1),
         "cpu seconds a search": round((searched - built) / 10, 3),
-        "peak MiB": round(memory_mib("VmHWM")),
-        "of which imports": round(before),
+        "peak MiB": round(memory_mib("VmHWM"), 0),
+        "of which imports": round(before, 0),
     }

@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import os
 import statistics
 import sys
 import time
@@ -128,18 +127,10 @@ def forget_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def resident_mb() -> float:
-    """The memory that this process holds now; not a number but on Linux."""
-    statm = Path("/proc/self/statm")
-    if not statm.exists():
-        return float("nan")
-    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
 def memory_mib(field: str) -> float:
-    """A figure of this process in MiB: VmRSS, resident now, or VmHWM, the most so far."""
+    """A figure of this process: VmRSS, resident now, or VmHWM, the most so far; Linux, else nan."""
     status = Path("/proc/self/status")
-    if not status.exists():  # not Linux
-        return 0.0
+    if not status.exists():
+        return float("nan")
     lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
     return int(lines[field].split()[0]) / 1024

@@ -1,5 +1,6 @@
 """A run that is killed goes on where it stood, and ends as if nothing had happened."""
 
+import fcntl
 import json
 import os
 import random
@@ -142,6 +143,14 @@ def test_a_run_that_another_process_works_on_is_refused(tmp_path):
     one.folder.mkdir(parents=True)
     with locked(one.folder / "lock"), pytest.raises(ValueError, match="by another process"):
         run(one)
+
+
+def test_who_only_looks_whether_a_run_is_locked_does_not_keep_it_from_starting(tmp_path):
+    with open(tmp_path / "lock", "w") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN)).start()
+        with locked(tmp_path / "lock"):
+            pass
 
 
 def test_force_does_not_walk_into_a_run_that_another_process_works_on(tmp_path, monkeypatch):

@@ -12,11 +12,10 @@ import warnings
 import zlib
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions, script
 from wpt_agents.zoo.curious import Expedition, explore_each
 from wpt_agents.zoo.policies import SavedPolicy, load_policy, sees_states
 from wpt_agents.zoo.progress import progress
+from wpt_agents.zoo.workers import worker_pool
 
 BEHAVIOURS = ("random", "noise", "scripted", "policy", *EXPLORERS)
 SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
@@ -321,7 +321,7 @@ def _played(jobs: Sequence[Job], workers: int) -> Iterator[list[Trajectory]]:
     if workers < 2 or len(jobs) < 2:
         yield from map(play, jobs)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with worker_pool(workers) as pool:
         ahead: deque[Future[list[Trajectory]]] = deque()
         try:
             for job in jobs:

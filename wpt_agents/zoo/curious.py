@@ -5,11 +5,9 @@ episode; from the two it goes on as if it had never stopped.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import torch
 from wpt_agents.dataset import TrajectoryDataset
 from wpt_agents.exploration import EXPLORE, EXPLORERS, Explorer
 from wpt_agents.trajectory import Trajectory
+from wpt_agents.zoo.workers import worker_pool
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def explore_each(
                 moved(_stored(trips))
             yield TrajectoryDataset.open(trip.folder / "data")
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with worker_pool(workers) as pool:
         futures = [pool.submit(_explore_all, trip) for trip in trips]
         try:
             for trip, future in zip(trips, futures, strict=True):

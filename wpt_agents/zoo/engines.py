@@ -26,6 +26,7 @@ from wpt_agents.zoo.machine import check_machine, import_extra
 from wpt_agents.zoo.plan import METHODS, Run
 from wpt_agents.zoo.stages import console, locked, say
 from wpt_agents.zoo.watch import shown
+from wpt_agents.zoo.workers import end_with_parent
 
 Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called again and again while waiting; takes a moment
@@ -149,7 +150,7 @@ class Local:
         """A fresh process, so that no run inherits another's state."""
         context = get_context("forkserver")  # which imports once what each run needs
         context.set_forkserver_preload([benchmark.__name__])
-        process = context.Process(target=_in_process, args=(work, job, self.given.cpus))
+        process = context.Process(target=_in_child, args=(work, job, self.given.cpus))
         process.start()
         return process
 
@@ -157,6 +158,11 @@ class Local:
 def _in_process(work: Work, job: Run, cpus: int) -> None:
     torch.set_num_threads(cpus)
     work(job)
+
+
+def _in_child(work: Work, job: Run, cpus: int) -> None:
+    end_with_parent()
+    _in_process(work, job, cpus)
 
 
 def why(job: Run, code: int) -> str:

@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -34,6 +34,7 @@ from wpt_agents.zoo.presets import Preset
 from wpt_agents.zoo.tasks import find_tasks
 
 Callback = Callable[[int, dict[str, float]], None]  # of pre-training
+PATIENCE = 0.5  # seconds with a lock that is held: `zoo watch` looks at each for an instant
 
 console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
 
@@ -70,18 +71,27 @@ def locked(path: Path, wait: bool = False) -> Iterator[None]:
     """Keeps other processes out while the block runs; the lock ends with its process.
 
     :param path: a file that stands for what is locked
-    :param wait: until it is free, instead of refusing
+    :param wait: until it is free, instead of refusing after `PATIENCE`
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            raise ValueError(
-                f"{path.parent} is being worked on by another process: wait for it, or use "
-                "another --out"
-            ) from None
+        until = time.monotonic() + PATIENCE
+        while not _taken(file, wait):
+            if time.monotonic() > until:
+                raise ValueError(
+                    f"{path.parent} is being worked on by another process: wait for it, or use "
+                    "another --out"
+                )
+            time.sleep(PATIENCE / 10)
         yield
+
+
+def _taken(file: IO[str], wait: bool) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    return True
 
 
 def write_json(path: Path, value: Any) -> None:

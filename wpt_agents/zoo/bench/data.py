@@ -5,13 +5,11 @@ Times are CPU time of this process, all its threads, with the files in the page 
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +24,7 @@ from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.formats import FORMATS, Read, store
 from wpt_agents.zoo.bench.timing import memory_mib
 from wpt_agents.zoo.collect import collect
+from wpt_agents.zoo.workers import worker_pool
 
 Rows = Iterator[dict[str, Any]]
 BATCH = 16, 64  # Table 2's
@@ -180,7 +179,7 @@ def large_store(path: Path, count: int, copies: int, workers: Sequence[int]) -> 
     """A store of `count` synthetic trajectories, `copies` times over, in a process of its own."""
     make_store(path, count, copies)
     for threads in workers:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with worker_pool(1) as pool:
             yield {"what": "large store", **pool.submit(use_store, path, threads).result()}
 
 

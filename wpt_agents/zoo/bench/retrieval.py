@@ -6,9 +6,7 @@ robot's name nor its action width. Data and model are kept in `runs/bench/retrie
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +19,7 @@ from wpt_agents.retrieval import Retriever
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.timing import memory_mib
 from wpt_agents.zoo.collect import collect
+from wpt_agents.zoo.workers import worker_pool
 
 FOLDER = Path("runs") / "bench" / "retrieval"
 DMC = ("cartpole-swingup", "acrobot-swingup", "cheetah-run", "walker-run", "quadruped-run")
@@ -120,7 +119,7 @@ class _Blank:
 
 def index_cost(trajectories: int, width: int) -> dict[str, Any]:
     """Seconds and peak memory of building and searching, in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with worker_pool(1) as pool:
         return pool.submit(_index_cost, trajectories, width).result()
 
 

@@ -11,15 +11,21 @@ from torch._dynamo.backends.registry import lookup_backend
 from wpt_agents import networks
 from wpt_agents.compiled import compile_loops
 from wpt_agents.rssm import RSSM, BlockGRU
+from wpt_agents.world_model import WorldModel, squared_error
 
 
 def plain(layer, x):
     return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
 
 
+def error(model, latent, image):
+    return squared_error(networks.to_unit(image), model.decode(latent))
+
+
 def by_definition(patch):
     patch.setattr(networks.UpConv, "forward", plain)
     patch.setattr(networks.FromPixel, "forward", plain)
+    patch.setattr(WorldModel, "reconstruction_error", error)
     patch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
     patch.setattr(RSSM, "_scan", RSSM._filter)
     forward = BlockGRU.forward

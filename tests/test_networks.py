@@ -14,7 +14,9 @@ from wpt_agents.networks import (
     SmallUpConv,
     ToPixels,
     UpConv,
+    by_parity,
     frozen,
+    interleaved,
     to_uint8,
     to_unit,
 )
@@ -40,6 +42,14 @@ def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, wi
     theirs = torch.autograd.grad((plain * weight).sum(), leaves)
     for a, b in zip(torch.autograd.grad((result * weight).sum(), leaves), theirs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_pixels_by_parity_are_those_of_the_image():
+    image = noise(2, 6, 4, 3)
+    parities = by_parity(image)
+    assert parities.shape == (2, 3, 2, 12)
+    torch.testing.assert_close(parities[1, 2, 1], image[1, 4:6, 2:4].reshape(12))
+    torch.testing.assert_close(interleaved(parities), image)
 
 
 @pytest.mark.parametrize(("layer", "kernel", "width"), [(SmallUpConv, 5, 5), (ToPixels, 6, 30)])

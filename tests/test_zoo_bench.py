@@ -41,6 +41,7 @@ def test_work_is_counted_as_the_layers_are_defined():
     assert timing.gflop(lambda: up(pixels)) == pytest.approx(work / 1e9)
     one, pixel = FromPixel(4, 2, 5), torch.ones(3, 4, 1, 1)
     assert timing.gflop(lambda: one(pixel)) == pytest.approx(2 * 3 * 4 * 2 * 25 / 1e9)
+    assert timing.gflop(lambda: up.parities(pixels)) == pytest.approx(work / 1e9)
     forwards = {kind.forward for kind in (UpConv, FromPixel)}
     assert nn.ConvTranspose2d.forward not in forwards and len(forwards) == 2  # fast ones are back
 

@@ -149,15 +149,21 @@ class UpConv(nn.ConvTranspose2d):
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # its size is no choice
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+        out = interleaved(self.parities(x))
+        out = out if self.kernel_size[0] == 6 else out[:, :-1, :-1]
+        return out.permute(0, 3, 1, 2)
+
+    def parities(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs), which `interleaved` makes an image."""
         inputs, outputs, kernel, _ = self.weight.shape
         weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
         phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
         phases = phases.reshape(4 * outputs, inputs, 3, 3)
-        out = F.conv2d(x, phases, self.bias.repeat(4), padding=2)
-        out = out.permute(0, 2, 3, 1).unflatten(-1, (2, 2, outputs)).transpose(2, 3)
-        out = out.flatten(3, 4).flatten(1, 2)
-        out = out if kernel == 6 else out[:, :-1, :-1]
-        return out.permute(0, 3, 1, 2)
+        bias = self.bias.repeat(4)
+        if not in_bfloat16(x):
+            return F.conv2d(x, phases, bias, padding=2).permute(0, 2, 3, 1)
+        # within oneDNN's convolution the gradient of the bias takes much of its way back
+        return F.conv2d(x, phases, padding=2).permute(0, 2, 3, 1).add_(bias)
 
 
 class SmallUpConv(UpConv):
@@ -173,12 +179,24 @@ class SmallUpConv(UpConv):
 class ToPixels(UpConv):
     """The last `UpConv`; on a CPU in float32 always, as bfloat16 takes longer for few channels."""
 
-    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
-        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+    def parities(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs)."""
         if not in_bfloat16(x):
-            return super().forward(x)
+            return super().parities(x)
         with torch.autocast("cpu", enabled=False):
-            return super().forward(x.float())
+            return super().parities(x.float())
+
+
+def interleaved(parities: Tensor) -> Tensor:
+    """(N, H, W, 4 C) -> (N, 2H, 2W, C): the pixels (2i + p, 2j + q) of all p and q in {0, 1}."""
+    pixels = parities.unflatten(-1, (2, 2, -1)).transpose(2, 3)
+    return pixels.flatten(3, 4).flatten(1, 2)
+
+
+def by_parity(image: Tensor) -> Tensor:
+    """(N, 2H, 2W, C) -> (N, H, W, 4 C), the inverse of `interleaved`."""
+    pixels = image.unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).transpose(2, 3)
+    return pixels.flatten(3)
 
 
 def in_bfloat16(x: Tensor) -> bool:
@@ -237,6 +255,12 @@ class Decoder(nn.Module):
     def images(self, code: Tensor) -> Tensor:
         """(N, C) -> (N, 64, 64, 3), about -0.5 .. 0.5, all at once."""
         return self.layers(code[..., None, None]).permute(0, 2, 3, 1)
+
+    def parities(self, code: Tensor) -> Tensor:
+        """(N, C) -> (N, 32, 32, 12), which `interleaved` makes the images."""
+        last = self.layers[-1]
+        assert isinstance(last, ToPixels)
+        return last.parities(self.layers[:-1](code[..., None, None]))
 
 
 class Head(nn.Module):

@@ -9,7 +9,16 @@ from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import BINS, kl_one_hot, two_hot_loss, two_hot_mean
 from wpt_agents.names import unknown_name
-from wpt_agents.networks import Decoder, Encoder, Head, Size, in_pieces, to_uint8, to_unit
+from wpt_agents.networks import (
+    Decoder,
+    Encoder,
+    Head,
+    Size,
+    by_parity,
+    in_pieces,
+    to_uint8,
+    to_unit,
+)
 from wpt_agents.rssm import RSSM, Latent
 from wpt_agents.trajectory import Batch
 
@@ -123,14 +132,15 @@ class WorldModel(nn.Module):
         return self.decoder(flat.deter, flat.stoch).unflatten(0, latent.deter.shape[:2])
 
     def reconstruction_error(self, latent: Latent, image: Tensor) -> Tensor:
-        """`squared_error` of decoding (B, T, ...) states, against (B, T, 64, 64, 3) uint8: (B, T).
+        """`squared_error(to_unit(image), self.decode(latent))`: (B, T), of (B, T, 64, 64, 3) uint8.
 
-        On a CPU a few images at a time, so that they never take much memory.
+        The pixels are compared in the order in which the decoder's last layer has them, on a CPU a
+        few images at a time: neither the order nor all images at once are ever needed.
         """
         flat, decoder = latent.flatten_time(), self.decoder
 
         def error(image: Tensor, code: Tensor) -> Tensor:
-            return squared_error(to_unit(image), decoder.images(code))
+            return squared_error(to_unit(by_parity(image)), decoder.parities(code))
 
         code = decoder.code(flat.deter, flat.stoch)
         errors = in_pieces(error, decoder.largest, image.flatten(0, 1), code)

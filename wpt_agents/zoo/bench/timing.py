@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from wpt_agents.networks import FromPixel, UpConv
+from wpt_agents.networks import FromPixel, UpConv, by_parity
 
 
 def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple[float, float]:
@@ -84,14 +85,15 @@ def _by_definition() -> Iterator[None]:
     def plain(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
         return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
 
-    fast: dict[Any, Any] = {kind: kind.forward for kind in (UpConv, FromPixel)}
-    for kind in fast:
-        kind.forward = plain
-    try:
+    def parities(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
+        return by_parity(plain(layer, x).permute(0, 2, 3, 1))
+
+    with (
+        patch.object(UpConv, "forward", plain),
+        patch.object(UpConv, "parities", parities),
+        patch.object(FromPixel, "forward", plain),
+    ):
         yield
-    finally:
-        for kind, forward in fast.items():
-            kind.forward = forward
 
 
 def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:

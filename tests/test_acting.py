@@ -9,6 +9,7 @@ from debug_agent import agent, noise
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_env import LENGTH, DotEnv
 
+from wpt_agents import acting
 from wpt_agents.acting import PATCHES, FastStep
 
 NAMES = ("deter", "stoch", "action")
@@ -42,6 +43,14 @@ def assert_defined(policy, n=1, **kwargs):
 @pytest.mark.parametrize("n", [1, 2, PATCHES // 36 + 1])  # 14 x 14 patches make 6 x 6
 def test_the_quick_step_is_the_defined_one(size, deterministic, n):
     assert_defined(agent(size=size).policy, n, deterministic=deterministic)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_wide_z_picks_rows(n, monkeypatch):
+    monkeypatch.setattr(acting, "WIDE_STOCH", 64)
+    policy = agent(size="tiny").policy
+    assert policy._stepper().outputs.from_stoch.rows is not None
+    assert_defined(policy, n)
 
 
 def test_the_quick_step_calls_fewer_operators():

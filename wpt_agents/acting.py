@@ -18,6 +18,7 @@ from wpt_agents.networks import NORM_EPS, Encoder
 from wpt_agents.rssm import RSSM, Latent
 
 PATCHES = 256  # of several images; up to so many, a convolution is quicker as a matrix product
+WIDE_STOCH = 1024  # from so many numbers in z on, picking rows is quicker than a matrix product
 
 
 class Layer(NamedTuple):
@@ -42,6 +43,26 @@ def linear_norm(layers: Iterable[Any]) -> Layer:
     """A `LinearNorm` as a Layer."""
     linear, norm, _ = layers
     return Layer(linear.weight.t(), linear.bias, norm)
+
+
+class OneHotProduct:
+    """z W' + x for a z of ones and zeros, (N, S, C).
+
+    A wide z picks the rows of its S ones: of W a C-th is read, and reading takes the time.
+    """
+
+    def __init__(self, weight: Tensor, classes: int) -> None:
+        self.matrix, wide = weight.t(), weight.shape[1] >= WIDE_STOCH
+        self.rows = self.matrix.contiguous() if wide else None
+        self.first = torch.arange(0, weight.shape[1], classes)
+
+    def __call__(self, x: Tensor, stoch: Tensor) -> Tensor:
+        """(outputs,) or (N, outputs), and z -> (N, outputs)."""
+        if self.rows is None:
+            return torch.addmm(x, stoch.flatten(1), self.matrix)
+        value, index = stoch.max(-1)  # 0 where an episode begins
+        index += self.first
+        return F.embedding_bag(index, self.rows, mode="sum", per_sample_weights=value).add_(x)
 
 
 class FastConv:
@@ -97,8 +118,10 @@ class FastFilter:
     def __init__(self, rssm: RSSM) -> None:
         gru, size, width = rssm.gru, rssm.size, rssm.size.deter // rssm.gru.blocks
         self.size, self.unimix, self.blocks = size, rssm.unimix, gru.blocks
-        inputs = gru.from_deter, gru.from_stoch, gru.from_action
-        self.inputs = [linear_norm(layers) for layers in inputs]
+        self.from_deter, self.from_action = map(linear_norm, (gru.from_deter, gru.from_action))
+        from_stoch, self.stoch_norm, _ = list[Any](gru.from_stoch)
+        self.from_stoch = OneHotProduct(from_stoch.weight, size.classes)
+        self.stoch_bias = from_stoch.bias
         self.shared = gru.shared_weight().t().contiguous().t()
         self.hidden_bias, self.own = gru.hidden.bias, gru.hidden.weight[:, :width]
         self.norm, self.gates = gru.norm, gru.gates.weight
@@ -135,8 +158,9 @@ class FastFilter:
 
     def _next_deter(self, state: Latent, action: Tensor) -> Tensor:
         n, blocks = len(action), self.blocks
-        seen = zip(self.inputs, (state.deter, state.stoch.flatten(1), action), strict=True)
-        inputs = torch.cat([layer(x) for layer, x in seen], 1)
+        from_stoch = norm_silu(self.from_stoch(self.stoch_bias, state.stoch), self.stoch_norm)
+        seen = self.from_deter(state.deter), from_stoch, self.from_action(action)
+        inputs = torch.cat(seen, 1)
         own = in_blocks(state.deter, blocks)
         shared = torch.addmm(self.hidden_bias, inputs, self.shared)
         hidden = torch.baddbmm(in_blocks(shared, blocks), own, self.own)
@@ -155,11 +179,11 @@ def in_blocks(x: Tensor, blocks: int) -> Tensor:
 class FastActor:
     """The outputs of the actor's network, (N, 2 A)."""
 
-    def __init__(self, actor: Actor) -> None:
+    def __init__(self, actor: Actor, classes: int) -> None:
         block, self.norm, _, self.from_deter = list[Any](actor.from_deter)
         self.block, self.blocks = block.weight, len(block.weight)
         self.block_bias = block.bias.view(self.blocks, 1, -1)
-        self.from_stoch = actor.from_stoch
+        self.from_stoch = OneHotProduct(actor.from_stoch.weight, classes)
         self.bias = self.from_deter.bias + actor.from_stoch.bias
         *hidden, self.last = list[Any](actor.layers)
         self.hidden = [linear_norm(layers) for layers in hidden]
@@ -169,7 +193,7 @@ class FastActor:
         x = torch.baddbmm(self.block_bias, in_blocks(state.deter, self.blocks), self.block)
         x = norm_silu(x.transpose(0, 1).reshape(len(state.deter), -1), self.norm)
         x = torch.addmm(self.bias, x, self.from_deter.weight.t())
-        x = x.addmm_(state.stoch.flatten(1), self.from_stoch.weight.t())
+        x = self.from_stoch(x, state.stoch)
         for layer in self.hidden:
             x = layer(x)
         return torch.addmm(self.last.bias, x, self.last.weight.t())
@@ -181,7 +205,7 @@ class FastStep:
     def __init__(self, encoder: Encoder, rssm: RSSM, actor: Actor) -> None:
         self.networks = encoder, rssm, actor
         self.encode, self.filter = FastEncoder(encoder), FastFilter(rssm)
-        self.outputs = FastActor(actor)
+        self.outputs = FastActor(actor, rssm.size.classes)
         self.places: list[tuple[dict[str, Any], str]] = [
             (module._parameters, name)
             for network in self.networks

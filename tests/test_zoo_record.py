@@ -168,6 +168,12 @@ def test_methods_are_told_from_doing_nothing_to_ours():
     assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]
 
 
+def test_a_method_of_two_presets_is_drawn_with_what_was_changed():
+    keys = [("scratch", "tiny", 10), ("wpt", "tiny", 10), ("wpt", "tiny train_ratio=64", 10)]
+    assert record._names(keys) == ["scratch", "wpt", "wpt, train_ratio=64"]
+    assert record._names([*keys, ("wpt", "tiny", 30)])[1] == "wpt, 10 frames"
+
+
 def test_a_method_of_two_budgets_is_drawn_with_both():
     keys = [("nothing", "", 0), ("scratch", "tiny", 100), ("scratch", "tiny", 3000)]
     assert record._names(keys) == ["nothing", "scratch, 100 frames", "scratch, 3,000 frames"]

@@ -7,7 +7,7 @@ lines of runs that are gone stay, lines of the same run are replaced.
 import csv
 import io
 import shlex
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
@@ -314,7 +314,14 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
 
 
 def _names(shown: Iterable[Key]) -> list[str]:
-    """Methods; where one stands more than once, with its frames."""
-    keys = list(shown)
-    times = Counter(method for method, *_ in keys)
-    return [m if times[m] == 1 else f"{m}, {frames:,} frames" for m, _, frames in keys]
+    """Methods; where one has several presets or budgets, with what was changed and its frames."""
+    keys, presets, budgets = list(shown), defaultdict(set), defaultdict(set)
+    for method, preset, frames in keys:
+        presets[method].add(preset)
+        budgets[method].add(frames)
+    names = []
+    for method, preset, frames in keys:
+        changes = shlex.split(preset)[1:] if len(presets[method]) > 1 else []
+        budget = [f"{frames:,} frames"] if len(budgets[method]) > 1 else []
+        names.append(", ".join([method, *changes, *budget]))
+    return names

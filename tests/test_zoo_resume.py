@@ -21,7 +21,7 @@ from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for ea
 
 from wpt_agents.model_file import read_model
 from wpt_agents.wpt import WPT
-from wpt_agents.zoo import benchmark
+from wpt_agents.zoo import benchmark, stages
 from wpt_agents.zoo.benchmark import run
 from wpt_agents.zoo.checkpoints import last_checkpoint
 from wpt_agents.zoo.evaluation import EpisodeSeeds, make_vec_env
@@ -145,7 +145,10 @@ def test_a_run_that_another_process_works_on_is_refused(tmp_path):
         run(one)
 
 
-def test_who_only_looks_whether_a_run_is_locked_does_not_keep_it_from_starting(tmp_path):
+def test_who_only_looks_whether_a_run_is_locked_does_not_keep_it_from_starting(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(stages, "PATIENCE", 10)
     with open(tmp_path / "lock", "w") as looking:
         fcntl.flock(looking, fcntl.LOCK_SH)
         threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN)).start()

@@ -5,14 +5,18 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
 PARENT = """
+import os
+import sys
 import time
-from multiprocessing import get_context
 
-from wpt_agents.zoo.workers import end_with_parent, worker_pool
+from wpt_agents.zoo.engines import Local, Resources
+from wpt_agents.zoo.workers import worker_pool
 
 
 def wait(path):
@@ -21,21 +25,21 @@ def wait(path):
     time.sleep(600)
 
 
-def child(path):
-    end_with_parent()
-    wait(path)
+if __name__ == "__main__":
+    START
+    time.sleep(600)
 """
 STARTS = {
-    "pool": "with worker_pool(1) as pool: pool.submit(wait, sys.argv[1]).result()",
-    "forkserver": "get_context('forkserver').Process(target=child, args=sys.argv[1:]).start()",
+    "pool": "worker_pool(1).submit(wait, sys.argv[1]).result()",
+    "engine": "Local(Resources()).start(wait, sys.argv[1])",
 }
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes through /proc")
 @pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
 def test_a_worker_ends_with_a_killed_parent(tmp_path, start):
     script, told = tmp_path / "parent.py", tmp_path / "pid"
-    main = f"\nif __name__ == '__main__':\n    {start}\n    time.sleep(600)\n"
-    script.write_text("import os\nimport sys\n" + PARENT + main)
+    script.write_text(PARENT.replace("START", start))
     parent = subprocess.Popen([sys.executable, str(script), str(told)])
     try:
         worker = int(until(lambda: told.exists() and told.read_text()))
@@ -43,10 +47,14 @@ def test_a_worker_ends_with_a_killed_parent(tmp_path, start):
     finally:
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-    until(lambda: not alive(worker))
+    try:
+        until(lambda: not alive(worker))
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
 
 
-def until(true, seconds=60):
+def until(true, seconds=300):
     """What `true` returns once it is true."""
     end = time.monotonic() + seconds
     while not (value := true()):
@@ -56,9 +64,7 @@ def until(true, seconds=60):
 
 
 def alive(pid):
-    try:
-        os.kill(pid, 0)
-        with open(f"/proc/{pid}/stat") as file:  # one that nobody waits for is not alive
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except (ProcessLookupError, FileNotFoundError):
-        return False
+    with suppress(ProcessLookupError, FileNotFoundError):
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return state != "Z"  # one that nobody waits for is not alive
+    return False

@@ -46,9 +46,11 @@ def linear_norm(layers: Iterable[Any]) -> Layer:
 
 
 class OneHotProduct:
-    """z W' + x for a z of ones and zeros, (N, S, C).
+    """z W' + x for a z (N, S, C) whose groups are one-hot, or zero where an episode begins.
 
-    A wide z picks the rows of its S ones: of W a C-th is read, and reading takes the time.
+    A wide z picks the columns of W at its ones: a C-th of W is read, and reading takes the time.
+
+    :param weight: W, (outputs, S C)
     """
 
     def __init__(self, weight: Tensor, classes: int) -> None:

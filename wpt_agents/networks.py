@@ -130,9 +130,11 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """(..., 64, 64, channels_in) uint8 -> (..., E)."""
         assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
-        x = to_unit(image).flatten(0, -4).permute(0, 3, 1, 2)  # channels_last in memory
-        x = in_pieces(self.layers, 31 * 31 * self.depth, x)
+        x = in_pieces(self._features, 31 * 31 * self.depth, image.flatten(0, -4))
         return x.flatten(1).unflatten(0, image.shape[:-3])
+
+    def _features(self, image: Tensor) -> Tensor:
+        return self.layers(to_unit(image).permute(0, 3, 1, 2))  # channels_last in memory
 
 
 class UpConv(nn.ConvTranspose2d):
@@ -162,8 +164,9 @@ class UpConv(nn.ConvTranspose2d):
         bias = self.bias.repeat(4)
         if not in_bfloat16(x):
             return F.conv2d(x, phases, bias, padding=2).permute(0, 2, 3, 1)
-        # within oneDNN's convolution the gradient of the bias takes much of its way back
-        return F.conv2d(x, phases, padding=2).permute(0, 2, 3, 1).add_(bias)
+        # oneDNN's gradient of a bias in bfloat16 is slow; that of an addition is a plain sum
+        out = F.conv2d(x, phases, padding=2).permute(0, 2, 3, 1)
+        return out.add_(bias.to(out.dtype))
 
 
 class SmallUpConv(UpConv):

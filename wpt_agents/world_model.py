@@ -34,8 +34,8 @@ class WorldModelLoss(NamedTuple):
 def squared_error(image: Tensor, reconstruction: Tensor) -> Tensor:
     """-ln p(o_t | z_t, h_t) of a Gaussian of fixed variance, up to constants: summed over a frame.
 
-    :param image: (..., 64, 64, 3), the true frames in [-0.5, 0.5]
-    :param reconstruction: (..., 64, 64, 3)
+    :param image: (..., H, W, C), the true frames in [-0.5, 0.5], their pixels in any order
+    :param reconstruction: (..., H, W, C)
     :return: (...)
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
@@ -134,8 +134,8 @@ class WorldModel(nn.Module):
     def reconstruction_error(self, latent: Latent, image: Tensor) -> Tensor:
         """`squared_error(to_unit(image), self.decode(latent))`: (B, T), of (B, T, 64, 64, 3) uint8.
 
-        The pixels are compared in the order in which the decoder's last layer has them, on a CPU a
-        few images at a time: neither the order nor all images at once are ever needed.
+        The decoded pixels are never put in the order of an image, nor on a CPU all images held at
+        once.
         """
         flat, decoder = latent.flatten_time(), self.decoder
 

@@ -1,4 +1,4 @@
-"""Processes of their own for work, which end with the process that began them."""
+"""Worker processes that end with the process that began them."""
 
 import os
 import threading

@@ -314,14 +314,15 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
 
 
 def _names(shown: Iterable[Key]) -> list[str]:
-    """Methods; where one has several presets or budgets, with what was changed and its frames."""
+    """Methods; where one has several presets or budgets, with what tells these apart."""
     keys, presets, budgets = list(shown), defaultdict(set), defaultdict(set)
     for method, preset, frames in keys:
-        presets[method].add(preset)
+        presets[method].add(frozenset(shlex.split(preset)))
         budgets[method].add(frames)
     names = []
     for method, preset, frames in keys:
-        changes = shlex.split(preset)[1:] if len(presets[method]) > 1 else []
+        common = frozenset.intersection(*presets[method])
+        changes = [word for word in shlex.split(preset) if word not in common]
         budget = [f"{frames:,} frames"] if len(budgets[method]) > 1 else []
         names.append(", ".join([method, *changes, *budget]))
     return names

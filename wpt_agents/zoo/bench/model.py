@@ -11,10 +11,11 @@ from wpt_agents.trajectory import Batch
 from wpt_agents.updates import UPDATE
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.bench.timing import (
-    ceiling,
     cost,
     forget_peak,
     gflop,
+    matmul,
+    matmul_gflop,
     peak_rss_mb,
     seconds_in_turn,
 )
@@ -32,7 +33,7 @@ def rows(
     """One row a case; `quick` takes the debug size and one repetition."""
     torch.set_num_threads(threads)
     for case in (("debug", 2, 8),) if quick else CASES:
-        yield from updates(*case, precision, 1 if quick else 3, compiled)
+        yield from updates(*case, precision, 1 if quick else 5, compiled)
 
 
 def updates(
@@ -63,7 +64,7 @@ def measured_in_turn(
     repetitions: int,
     counted: Sequence[Callable[[], Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """A row for each of several steps, which take turns: time, work, memory, and the ceiling.
+    """A row for each of several steps, which take turns with the ceiling: time, work, memory.
 
     :param counted: the like of the steps for counting their work, which compiled code hides
     """
@@ -71,9 +72,8 @@ def measured_in_turn(
     work = [gflop(step) for step in counted or steps]
     held = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    before = ceiling(device=device)
-    times = seconds_in_turn(steps, repetitions, warmup=1)
-    limit = (before + ceiling(device=device)) / 2
+    *times, limiting = seconds_in_turn([*steps, matmul(device=device)], repetitions, warmup=1)
+    limit = matmul_gflop() / cost(*limiting)
     rows = []
     for (_, about), (processor, wall), flops, peak in zip(cases, times, work, held, strict=True):
         median = cost(processor, wall)

@@ -17,6 +17,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from wpt_agents.networks import FromPixel, UpConv, by_parity
 
+SIDE = 1024  # of the matrices whose product is the ceiling
+MATMULS = 5  # in a row, so that a turn of them takes about a tenth of a second
+
 
 def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple[float, float]:
     """The medians of `step`'s processor time (this process, all threads) and of its wall-clock.
@@ -54,10 +57,15 @@ def _wait() -> None:
         torch.cuda.synchronize()
 
 
-def ceiling(dtype: torch.dtype = torch.float32, device: str = "cpu", side: int = 1024) -> float:
-    """GFLOP/s of a matmul of two square matrices: no network does more on this machine."""
-    a, b = (torch.randn(side, side).to(device, dtype) for _ in range(2))
-    return 2 * side**3 / cost(*seconds(lambda: a @ b, repetitions=5)) / 1e9
+def matmul(device: str = "cpu") -> Callable[[], Any]:
+    """`MATMULS` products of two square matrices: the ceiling, no network does more a second."""
+    a, b = (torch.randn(SIDE, SIDE).to(device) for _ in range(2))
+    return lambda: [a @ b for _ in range(MATMULS)]
+
+
+def matmul_gflop() -> float:
+    """The work of `matmul`."""
+    return MATMULS * 2 * SIDE**3 / 1e9
 
 
 def gflop(step: Callable[[], Any]) -> float:

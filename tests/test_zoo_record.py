@@ -170,9 +170,10 @@ def test_methods_are_told_from_doing_nothing_to_ours():
 
 def test_a_method_of_two_presets_is_drawn_with_what_was_changed():
     keys = [("scratch", "tiny", 10), ("wpt", "tiny", 10), ("wpt", "tiny train_ratio=64", 10)]
-    assert record._names(keys) == ["scratch", "wpt", "wpt, train_ratio=64"]
+    assert record._names(keys) == ["scratch", "wpt", "wpt,\ntrain_ratio=64"]
     assert record._names([*keys, ("wpt", "tiny", 30)])[1] == "wpt, 10 frames"
-    assert record._names([("wpt", "tiny", 10), ("wpt", "small", 10)]) == ["wpt, tiny", "wpt, small"]
+    others = [("wpt", "tiny", 10), ("wpt", "small", 10)]
+    assert record._names(others) == ["wpt,\ntiny", "wpt,\nsmall"]
 
 
 def test_a_method_of_two_budgets_is_drawn_with_both():

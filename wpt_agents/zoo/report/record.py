@@ -324,5 +324,5 @@ def _names(shown: Iterable[Key]) -> list[str]:
         common = frozenset.intersection(*presets[method])
         changes = [word for word in shlex.split(preset) if word not in common]
         budget = [f"{frames:,} frames"] if len(budgets[method]) > 1 else []
-        names.append(", ".join([method, *changes, *budget]))
+        names.append(", ".join([",\n".join([method, *changes]), *budget]))
     return names

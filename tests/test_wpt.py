@@ -522,8 +522,8 @@ def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_rewa
     model, episode = agent(ClockEnv()), recorded(length=6)
     episode = replace(episode, reward=np.arange(6, dtype=np.float32))
     world_model = model.policy.world_model
-    grey, three = torch.zeros(7, 64, 64, 3), torch.full((1, 7), 3.0)  # 0: between black and white
-    monkeypatch.setattr(world_model.decoder, "images", lambda code: grey)
+    grey, three = torch.zeros(7, 32, 32, 12), torch.full((1, 7), 3.0)  # 0: between black and white
+    monkeypatch.setattr(world_model.decoder, "parities", lambda code: grey)
     monkeypatch.setattr(world_model, "reward", lambda feat: three)
     errors = model.policy.heldout_errors(episode)
     by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()

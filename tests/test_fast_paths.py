@@ -8,7 +8,7 @@ from debug_agent import agent, pretrained, recorded, weights
 from torch import nn
 from torch._dynamo.backends.registry import lookup_backend
 
-from wpt_agents import networks
+from wpt_agents import networks, updates
 from wpt_agents.compiled import compile_loops
 from wpt_agents.rssm import RSSM, BlockGRU
 from wpt_agents.world_model import WorldModel, squared_error
@@ -22,18 +22,24 @@ def error(model, latent, image):
     return squared_error(networks.to_unit(image), model.decode(latent))
 
 
+def feats(states):
+    return torch.stack([state.feat for state in states], 1)
+
+
 def by_definition(patch):
     patch.setattr(networks.UpConv, "forward", plain)
     patch.setattr(networks.FromPixel, "forward", plain)
     patch.setattr(WorldModel, "reconstruction_error", error)
     patch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
+    patch.setattr(networks, "by_convolution", lambda rows: False)
+    patch.setattr(updates, "over_steps", lambda head, states: head(feats(states)))
     patch.setattr(RSSM, "_scan", RSSM._filter)
     forward = BlockGRU.forward
     patch.setattr(BlockGRU, "forward", lambda self, h, z, a, shared=None: forward(self, h, z, a))
 
 
 def three_updates(backend=None):
-    model = agent(batch_size=4, batch_length=6)
+    model = agent(batch_size=4, batch_length=8)
     if backend is not None:
         compile_loops(model.policy, backend)
     for seed in range(2):
@@ -46,6 +52,9 @@ def three_updates(backend=None):
 
 def test_three_updates_are_those_of_the_definition(monkeypatch):
     monkeypatch.setattr(networks, "PIECE", 5 * 32 * 32 * 12)  # several pieces, one incomplete
+    monkeypatch.setattr(updates, "PIECE", 5 * 32 * 32 * 12)  # less than the dreams have
+    monkeypatch.setattr(networks, "MANY", 16)
+    monkeypatch.setattr(networks, "AVX512", True)  # whether or not it is there
     fast, after = three_updates()
     with monkeypatch.context() as patch:
         by_definition(patch)

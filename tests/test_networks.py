@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import nn
 
+from wpt_agents import networks
 from wpt_agents.networks import (
     SIZES,
     BlockLinear,
@@ -11,12 +12,16 @@ from wpt_agents.networks import (
     Encoder,
     FromPixel,
     Head,
-    SmallUpConv,
     ToPixels,
     UpConv,
+    as_image,
+    block_linear,
+    by_convolution,
     by_parity,
     frozen,
     interleaved,
+    linear,
+    phases,
     to_uint8,
     to_unit,
 )
@@ -44,6 +49,29 @@ def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, wi
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("kernel", [5, 6])
+def test_an_upconv_by_phases_is_the_transposed_convolution_on_the_way_back_too(kernel):
+    layer, x = UpConv(3, 2, kernel).double(), noise(2, 3, 4, 4, dtype=torch.float64)
+    leaves = x.requires_grad_(), layer.weight, layer.bias
+    plain = torch.nn.functional.conv_transpose2d(*leaves, stride=2)
+    weight = noise(*plain.shape, seed=1, dtype=torch.float64)
+    expected = torch.autograd.grad((plain * weight).sum(), leaves)
+    image = as_image(phases(*leaves), kernel).permute(0, 3, 1, 2)  # as on a GPU
+    torch.testing.assert_close(image, plain, rtol=1e-12, atol=1e-12)
+    found = torch.autograd.grad((image * weight).sum(), leaves)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_the_gradients_of_parities_are_those_of_the_image():
+    layer, x = UpConv(3, 2, 6).double(), noise(2, 3, 4, 4, dtype=torch.float64).requires_grad_()
+    leaves = x, layer.weight, layer.bias
+    slope = noise(2, 6, 6, 8, dtype=torch.float64)
+    parities = torch.autograd.grad((layer.parities(x) * slope).sum(), leaves)
+    image = torch.autograd.grad((layer(x) * interleaved(slope).permute(0, 3, 1, 2)).sum(), leaves)
+    torch.testing.assert_close(parities, image, rtol=1e-12, atol=1e-12)
+    assert all(gradient.any() for gradient in parities)
+
+
 def test_pixels_by_parity_are_those_of_the_image():
     image = noise(2, 6, 4, 3)
     parities = by_parity(image)
@@ -52,7 +80,7 @@ def test_pixels_by_parity_are_those_of_the_image():
     torch.testing.assert_close(interleaved(parities), image)
 
 
-@pytest.mark.parametrize(("layer", "kernel", "width"), [(SmallUpConv, 5, 5), (ToPixels, 6, 30)])
+@pytest.mark.parametrize(("layer", "kernel", "width"), [(UpConv, 5, 5), (ToPixels, 6, 30)])
 def test_what_bfloat16_computes_otherwise_is_the_transposed_convolution_too(layer, kernel, width):
     ours, x = layer(3, 2, kernel), noise(2, 3, width, width).requires_grad_()
     plain = torch.nn.functional.conv_transpose2d(x, ours.weight, ours.bias, stride=2)
@@ -65,6 +93,42 @@ def test_what_bfloat16_computes_otherwise_is_the_transposed_convolution_too(laye
     torch.testing.assert_close(result.float(), plain, rtol=0.02, atol=0.02)
     for a, b in zip(torch.autograd.grad((result * weight).sum(), leaves), expected, strict=True):
         assert (a - b).abs().max() < 0.02 * b.abs().max()
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, bias, monkeypatch):
+    monkeypatch.setattr(networks, "AVX512", True)  # the arithmetic is every CPU's
+    rows, inputs, outputs = 2 * networks.MANY, 12, 8
+    wide = noise(rows, inputs + 3).requires_grad_()
+    x = wide[:, 3:]  # as a head takes h and z from one tensor
+    weight = noise(blocks, inputs // blocks, outputs // blocks, seed=1).requires_grad_()
+    bias = noise(outputs, seed=2).requires_grad_() if bias else None
+    leaves = [wide, weight] + ([] if bias is None else [bias])
+    plain = x @ torch.block_diag(*weight) + (0 if bias is None else bias)
+    assert by_convolution(x)
+    found = block_linear(x, weight, bias) if blocks > 1 else linear(x, weight[0].t(), bias)
+    torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-5)
+    slope = noise(rows, outputs, seed=3)
+    expected = torch.autograd.grad(plain, leaves, slope)
+    gradients = torch.autograd.grad(found, leaves, slope)
+    torch.testing.assert_close(gradients, expected, rtol=1e-4, atol=1e-4)  # of sums of 512 rows
+    in_time = linear(x.unflatten(0, (4, -1)), noise(5, inputs))  # (B, T, inputs)
+    torch.testing.assert_close(in_time.flatten(0, 1), x @ noise(5, inputs).t())
+
+
+def test_which_rows_go_through_a_convolution(monkeypatch):
+    monkeypatch.setattr(networks, "AVX512", True)
+    many = networks.MANY
+    assert by_convolution(noise(many, 3))
+    assert not by_convolution(noise(many - 16, 3))
+    assert not by_convolution(noise(many + 1, 3))  # 16 images of equally many pixels
+    assert not by_convolution(noise(many, 3, dtype=torch.float64))
+    assert not by_convolution(noise(many, 3).to("meta"))
+    with torch.autocast("cpu", torch.bfloat16):  # whose products are oneDNN's anyway
+        assert not by_convolution(noise(many, 3))
+    monkeypatch.setattr(networks, "AVX512", False)
+    assert not by_convolution(noise(many, 3))
 
 
 def test_a_downconv_of_a_single_image_is_the_strided_convolution():

@@ -7,7 +7,8 @@ from rich.console import Console, ConsoleDimensions
 from torch import nn
 from typer.testing import CliRunner
 
-from wpt_agents.networks import FromPixel, ToPixels, UpConv
+from wpt_agents import networks
+from wpt_agents.networks import BlockLinear, FromPixel, ToPixels, UpConv
 from wpt_agents.wpt import WPT
 from wpt_agents.zoo.__main__ import app
 from wpt_agents.zoo.bench import model as bench_model
@@ -30,6 +31,29 @@ def test_the_model_bench_prints_a_json_object_for_each_case():
         assert row["gflop_per_s"] == pytest.approx(row["gflop"] / row["median_s"])
     alone, whole = rows
     assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
+
+
+def test_several_threads_take_turns_with_one():
+    seen = []
+    torch.set_num_threads(2)
+    try:
+        step = (lambda: seen.append(torch.get_num_threads())), {}
+        (row,) = bench_model.measured_in_turn([step], repetitions=2, counted=[lambda: None])
+        assert torch.get_num_threads() == row["threads"] == 2 and row["times_one_thread"] > 0
+    finally:
+        torch.set_num_threads(1)
+    assert seen == [2, *3 * [2, 1]]  # the memory; a warm-up and two repetitions
+    (row,) = bench_model.measured_in_turn([step], repetitions=1, counted=[lambda: None])
+    assert "times_one_thread" not in row
+
+
+def test_a_product_by_convolution_counts_as_the_product(monkeypatch):
+    monkeypatch.setattr(networks, "AVX512", True)
+    layer, x = BlockLinear(32, 64, 4), torch.ones(networks.MANY, 32)
+    assert networks.by_convolution(x)
+    work = 2 * 2 * networks.MANY * 32 * 64 / 4  # backward for the weights alone
+    assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(work / 1e9)
+    assert networks.by_convolution(x)  # it is back
 
 
 def test_work_is_counted_as_the_layers_are_defined():

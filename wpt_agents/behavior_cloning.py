@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from wpt_agents.networks import Encoder, LinearNorm, Size
+from wpt_agents.networks import Encoder, Linear, LinearNorm, Size
 from wpt_agents.trajectory import Trajectory
 
 FRAMES = 3  # what one image does not show, such as velocities, three do
@@ -88,7 +88,7 @@ class PriorActor(nn.Module):
         self.layers = nn.Sequential(
             LinearNorm(self.encoder.embed_dim, size.units),
             LinearNorm(size.units, size.units),
-            nn.Linear(size.units, action_dim),
+            Linear(size.units, action_dim),
         )
 
     def forward(self, image: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from wpt_agents.networks import Encoder, LinearNorm, Size, frozen
+from wpt_agents.networks import Encoder, Linear, LinearNorm, Size, frozen
 from wpt_agents.policy import Dream
 from wpt_agents.rssm import Latent
 from wpt_agents.trajectory import Batch, Trajectory
@@ -78,10 +78,10 @@ class ICM(nn.Module):
         super().__init__()
         self.forward_share, features, units = forward_share, size.units, size.units
         self.encoder = Encoder(size.depth)
-        self.project = nn.Linear(self.encoder.embed_dim, features)
-        self.inverse = nn.Sequential(LinearNorm(2 * features, units), nn.Linear(units, action_dim))
+        self.project = Linear(self.encoder.embed_dim, features)
+        self.inverse = nn.Sequential(LinearNorm(2 * features, units), Linear(units, action_dim))
         self.dynamics = nn.Sequential(
-            LinearNorm(features + action_dim, units), nn.Linear(units, features)
+            LinearNorm(features + action_dim, units), Linear(units, features)
         )
         self.scale = Scale()
 
@@ -138,7 +138,7 @@ class Ensemble(nn.Module):
             nn.Sequential(
                 LinearNorm(inputs, size.units),
                 LinearNorm(size.units, size.units),
-                nn.Linear(size.units, outputs),
+                Linear(size.units, outputs),
             )
             for _ in range(members)
         )

@@ -5,13 +5,20 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 NORM_EPS = 1e-3
 PIECE = 2**22  # numbers in the largest tensor that a stack of layers makes on a CPU: 16 MB
+MANY = 256  # rows from which on a product of matrices is worth a convolution
+IMAGES = 16  # of which a convolution takes these rows for the pixels
+AVX512 = torch.backends.mkldnn.is_available() and (
+    torch.backends.cpu.get_cpu_capability() == "AVX512"
+)
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,62 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """The product x W^T + b: (..., inputs), (outputs, inputs) -> (..., outputs)."""
+    if not by_convolution(x):
+        return F.linear(x, weight, bias)
+    return convolved(x.flatten(0, -2), weight, bias).unflatten(0, x.shape[:-1])
+
+
+def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """The like by a block-diagonal W: (N, inputs), (b, inputs/b, outputs/b) -> (N, outputs)."""
+    if by_convolution(x):
+        return convolved(x, weight.transpose(1, 2).flatten(0, 1), bias, len(weight))
+    blocks = x.unflatten(-1, (len(weight), -1)).transpose(0, 1)
+    if bias is None:
+        return torch.bmm(blocks, weight).transpose(0, 1).flatten(1)
+    bias = bias.view(len(weight), 1, -1)
+    return torch.baddbmm(bias, blocks, weight).transpose(0, 1).flatten(1)
+
+
+def by_convolution(x: Tensor) -> bool:
+    """Whether `convolved` is the quicker way: for many rows on a CPU with AVX-512, in float32.
+
+    oneDNN's convolutions use these instructions wherever there are any. MKL's products of
+    matrices, which are torch's, do without them on AMD's CPUs, at half the speed on the newest.
+    """
+    return (
+        AVX512
+        and x.device.type == "cpu"
+        and x.dtype == torch.float32
+        and x.shape[:-1].numel() >= MANY
+        and x.shape[:-1].numel() % IMAGES == 0
+        and not torch.is_autocast_enabled("cpu")
+    )
+
+
+def convolved(x: Tensor, weight: Tensor, bias: Tensor | None = None, blocks: int = 1) -> Tensor:
+    """The product x W^T + b as a 1x1 convolution whose pixels are the rows; the same sums.
+
+    Of 16 images, as torch hands a convolution of fewer to MKL, too.
+
+    :param x: (N, inputs), N a multiple of 16
+    :param weight: (outputs, inputs / blocks), the blocks of a block-diagonal matrix one below the
+        other
+    """
+    pixels = x.reshape(IMAGES, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)  # channels last in memory
+    out = F.conv2d(pixels, weight[..., None, None], bias, groups=blocks)
+    return out.permute(0, 2, 3, 1).flatten(0, 2)
+
+
+class Linear(nn.Linear):
+    """`nn.Linear` by `linear`."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) -> (..., outputs)."""
+        return linear(x, self.weight, self.bias)
+
+
 class BlockLinear(nn.Module):
     """A linear layer whose weight is block-diagonal: `blocks` times (inputs/b -> outputs/b).
 
@@ -80,16 +143,14 @@ class BlockLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs) -> (N, outputs)."""
-        blocks = x.reshape(len(x), len(self.weight), -1).transpose(0, 1)
-        bias = self.bias.view(len(self.weight), 1, -1)
-        return torch.baddbmm(bias, blocks, self.weight).transpose(0, 1).flatten(1)
+        return block_linear(x, self.weight, self.bias)
 
 
 class LinearNorm(nn.Sequential):
     """Linear, layer norm, SiLU."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(nn.Linear(inputs, outputs), nn.LayerNorm(outputs, eps=NORM_EPS), nn.SiLU())
+        super().__init__(Linear(inputs, outputs), nn.LayerNorm(outputs, eps=NORM_EPS), nn.SiLU())
 
 
 class DownConv(nn.Conv2d):
@@ -137,6 +198,9 @@ class Encoder(nn.Module):
         return self.layers(to_unit(image).permute(0, 3, 1, 2))  # channels_last in memory
 
 
+Form = Callable[[Tensor, int], Tensor]
+
+
 class UpConv(nn.ConvTranspose2d):
     """A transposed convolution of stride 2, computed as one 3x3 convolution and a pixel shuffle.
 
@@ -151,43 +215,74 @@ class UpConv(nn.ConvTranspose2d):
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # its size is no choice
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
-        out = interleaved(self.parities(x))
-        out = out if self.kernel_size[0] == 6 else out[:, :-1, :-1]
-        return out.permute(0, 3, 1, 2)
+        return self._upsampled(x, as_image).permute(0, 3, 1, 2)
 
     def parities(self, x: Tensor) -> Tensor:
         """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs), which `interleaved` makes an image."""
-        inputs, outputs, kernel, _ = self.weight.shape
-        weight = F.pad(self.weight, (0, 6 - kernel, 0, 6 - kernel))
-        phases = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
-        phases = phases.reshape(4 * outputs, inputs, 3, 3)
-        bias = self.bias.repeat(4)
-        if not in_bfloat16(x):
-            return F.conv2d(x, phases, bias, padding=2).permute(0, 2, 3, 1)
-        # oneDNN's gradient of a bias in bfloat16 is slow; that of an addition is a plain sum
-        out = F.conv2d(x, phases, padding=2).permute(0, 2, 3, 1)
-        return out.add_(bias.to(out.dtype))
+        return self._upsampled(x, as_parities)
+
+    def _upsampled(self, x: Tensor, form: Form) -> Tensor:
+        if x.device.type != "cpu" or in_bfloat16(x):
+            return form(phases(x, self.weight, self.bias), self.kernel_size[0])
+        return Upsample.apply(form, x, self.weight, self.bias)
 
 
-class SmallUpConv(UpConv):
-    """An `UpConv` of few pixels; torch's own is as quick there, but not on a CPU in bfloat16."""
+def phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """(N, inputs, H, W), (inputs, outputs, K, K), (outputs,) -> (N, H + 2, W + 2, 4 outputs)."""
+    inputs, outputs, kernel, _ = weight.shape
+    weight = F.pad(weight, (0, 6 - kernel, 0, 6 - kernel))
+    weight = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
+    weight, bias = weight.reshape(4 * outputs, inputs, 3, 3), bias.repeat(4)
+    if not in_bfloat16(x):
+        return F.conv2d(x, weight, bias, padding=2).permute(0, 2, 3, 1)
+    # oneDNN's gradient of a bias in bfloat16 is slow; that of an addition is a plain sum
+    out = F.conv2d(x, weight, padding=2).permute(0, 2, 3, 1)
+    return out.add_(bias.to(out.dtype))
 
-    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
-        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
-        if in_bfloat16(x):
-            return super().forward(x)
-        return F.conv_transpose2d(x, self.weight, self.bias, stride=2)
+
+class Upsample(torch.autograd.Function):
+    """There by `phases`, back as the transposed convolution: each way as it is quicker on a CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, form: Form, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """What `form` makes of the phases."""
+        ctx.form = form
+        ctx.save_for_backward(x, weight)
+        return form(phases(x, weight, bias), weight.shape[-1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        """The slopes of x, weight and bias."""
+        x, weight = ctx.saved_tensors
+        if ctx.form is as_parities:
+            slope = as_image(slope, weight.shape[-1])
+        return None, *torch.ops.aten.convolution_backward(
+            slope.permute(0, 3, 1, 2),
+            *(x, weight, [weight.shape[1]], [2, 2], [0, 0], [1, 1], True, [0, 0], 1),
+            ctx.needs_input_grad[1:],
+        )
 
 
 class ToPixels(UpConv):
     """The last `UpConv`; on a CPU in float32 always, as bfloat16 takes longer for few channels."""
 
-    def parities(self, x: Tensor) -> Tensor:
-        """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs)."""
+    def _upsampled(self, x: Tensor, form: Form) -> Tensor:
         if not in_bfloat16(x):
-            return super().parities(x)
+            return super()._upsampled(x, form)
         with torch.autocast("cpu", enabled=False):
-            return super().parities(x.float())
+            return super()._upsampled(x.float(), form)
+
+
+def as_image(parities: Tensor, kernel: int) -> Tensor:
+    """`interleaved`, less the row and the column that an odd kernel does not reach."""
+    image = interleaved(parities)
+    return image[:, :-1, :-1] if kernel % 2 else image
+
+
+def as_parities(parities: Tensor, kernel: int) -> Tensor:
+    """Left as they are."""
+    return parities
 
 
 def interleaved(parities: Tensor) -> Tensor:
@@ -214,7 +309,7 @@ class FromPixel(nn.ConvTranspose2d):
         """(N, inputs, 1, 1) -> (N, outputs, K, K), channels last in memory."""
         assert x.shape[-2:] == (1, 1), x.shape
         weight = self.weight.permute(0, 2, 3, 1)  # (inputs, K, K, outputs)
-        out = (x.flatten(1) @ weight.flatten(1)).unflatten(1, weight.shape[1:]) + self.bias
+        out = linear(x.flatten(1), weight.flatten(1).t()).unflatten(1, weight.shape[1:]) + self.bias
         return out.permute(0, 3, 1, 2)
 
 
@@ -228,16 +323,16 @@ class Decoder(nn.Module):
             BlockLinear(size.deter, width, size.blocks),
             nn.LayerNorm(width, eps=NORM_EPS),
             nn.SiLU(),
-            nn.Linear(width, code),
+            Linear(width, code),
         )
         self.from_stoch = nn.Sequential(
-            LinearNorm(size.stoch * size.classes, width), nn.Linear(width, code)
+            LinearNorm(size.stoch * size.classes, width), Linear(width, code)
         )
         self.layers = nn.Sequential(
             FromPixel(code, 4 * depth, 5),
             ChannelNorm(4 * depth),
             nn.SiLU(),
-            SmallUpConv(4 * depth, 2 * depth, 5),
+            UpConv(4 * depth, 2 * depth, 5),
             ChannelNorm(2 * depth),
             nn.SiLU(),
             UpConv(2 * depth, depth, 6),
@@ -252,18 +347,19 @@ class Decoder(nn.Module):
         return in_pieces(self.images, self.largest, self.code(deter, stoch))
 
     def code(self, deter: Tensor, stoch: Tensor) -> Tensor:
-        """(N, D), (N, S, K) -> (N, C), from which `images` makes the images."""
-        return self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
+        """(N, D), (N, S, K) -> (N, C, 5, 5), from which `images` makes the images."""
+        pixel = self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
+        return self.layers[0](pixel[..., None, None])
 
     def images(self, code: Tensor) -> Tensor:
-        """(N, C) -> (N, 64, 64, 3), about -0.5 .. 0.5, all at once."""
-        return self.layers(code[..., None, None]).permute(0, 2, 3, 1)
+        """(N, C, 5, 5) -> (N, 64, 64, 3), about -0.5 .. 0.5, all at once."""
+        return self.layers[1:](code).permute(0, 2, 3, 1)
 
     def parities(self, code: Tensor) -> Tensor:
-        """(N, C) -> (N, 32, 32, 12), which `interleaved` makes the images."""
+        """(N, C, 5, 5) -> (N, 32, 32, 12), which `interleaved` makes the images."""
         last = self.layers[-1]
         assert isinstance(last, ToPixels)
-        return last.parities(self.layers[:-1](code[..., None, None]))
+        return last.parities(self.layers[1:-1](code))
 
 
 class Head(nn.Module):
@@ -276,11 +372,11 @@ class Head(nn.Module):
             BlockLinear(size.deter, width, size.blocks),
             nn.LayerNorm(width, eps=NORM_EPS),
             nn.SiLU(),
-            nn.Linear(width, size.units),
+            Linear(width, size.units),
         )
-        self.from_stoch = nn.Linear(size.stoch * size.classes, size.units)
+        self.from_stoch = Linear(size.stoch * size.classes, size.units)
         hidden = [LinearNorm(size.units, size.units) for _ in range(layers)]
-        last = nn.Linear(size.units, outputs)
+        last = Linear(size.units, outputs)
         self.layers = nn.Sequential(*hidden, last)
         self.deter_dim, self.units = size.deter, size.units
         if zero_init:

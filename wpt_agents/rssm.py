@@ -8,7 +8,15 @@ import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
 from wpt_agents.distributions import Noise, mode_one_hot, sample_one_hot, unimix_logits
-from wpt_agents.networks import NORM_EPS, BlockLinear, LinearNorm, Size
+from wpt_agents.networks import (
+    NORM_EPS,
+    BlockLinear,
+    Linear,
+    LinearNorm,
+    Size,
+    block_linear,
+    linear,
+)
 from wpt_agents.scan import FilterScan
 
 
@@ -26,6 +34,10 @@ class Latent(NamedTuple):
     def detach(self) -> "Latent":
         """The same state, cut off from the graph."""
         return Latent(self.deter.detach(), self.stoch.detach())
+
+    def steps(self) -> list["Latent"]:
+        """(N, H, ...) -> H times (N, ...)."""
+        return [Latent(*step) for step in zip(*(x.unbind(1) for x in self), strict=True)]
 
     def flatten_time(self) -> "Latent":
         """(B, T, ...) -> (B*T, ...)."""
@@ -65,10 +77,8 @@ class BlockGRU(nn.Module):
             views = torch.cat([own, inputs.unsqueeze(1).expand(-1, self.blocks, -1)], -1)
             hidden = self.hidden(views.flatten(1))
         else:  # the same sums without a copy of the inputs for each block
-            width = own.shape[-1]
-            blocks = torch.bmm(own.transpose(0, 1), self.hidden.weight[:, :width])
-            hidden = torch.addmm(self.hidden.bias, inputs, shared)
-            hidden = hidden + blocks.transpose(0, 1).flatten(1)
+            weight = self.hidden.weight[:, : own.shape[-1]]
+            hidden = linear(inputs, shared.t(), self.hidden.bias) + block_linear(deter, weight)
         hidden = F.silu(self.norm(hidden))
         # the three gates of a unit stand in the unit's own block
         gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1))
@@ -95,11 +105,11 @@ class RSSM(nn.Module):
         self.prior_net = nn.Sequential(
             LinearNorm(size.deter, size.hidden),
             LinearNorm(size.hidden, size.hidden),
-            nn.Linear(size.hidden, code),
+            Linear(size.hidden, code),
         )
-        self.post_in = nn.Linear(size.deter + embed_dim, size.hidden)
+        self.post_in = Linear(size.deter + embed_dim, size.hidden)
         self.post_out = nn.Sequential(
-            nn.LayerNorm(size.hidden, eps=NORM_EPS), nn.SiLU(), nn.Linear(size.hidden, code)
+            nn.LayerNorm(size.hidden, eps=NORM_EPS), nn.SiLU(), Linear(size.hidden, code)
         )
 
     def initial(self, n: int) -> Latent:
@@ -122,10 +132,10 @@ class RSSM(nn.Module):
 
     def _embed_half(self, embed: Tensor) -> Tensor:
         """The image's share of the posterior's first layer, which needs no h."""
-        return F.linear(embed, self.post_in.weight[:, self.size.deter :], self.post_in.bias)
+        return linear(embed, self.post_in.weight[:, self.size.deter :], self.post_in.bias)
 
     def _posterior(self, deter: Tensor, embed_half: Tensor) -> Tensor:
-        deter_half = F.linear(deter, self.post_in.weight[:, : self.size.deter])
+        deter_half = linear(deter, self.post_in.weight[:, : self.size.deter])
         return self._log_probs(self.post_out(deter_half + embed_half))
 
     def _log_probs(self, logits: Tensor) -> Tensor:

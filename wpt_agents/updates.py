@@ -3,6 +3,7 @@
 `WPT` inherits `Updates`, so that `wpt.py` holds the algorithm and this module its gradient steps.
 """
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -22,7 +23,7 @@ from wpt_agents.actor_critic import (
 )
 from wpt_agents.behavior_cloning import FRAMES, bc_loss, recent_frames
 from wpt_agents.guidance import Schedule
-from wpt_agents.networks import SIZES, frozen
+from wpt_agents.networks import PIECE, SIZES, frozen
 from wpt_agents.policy import Dream, WPTPolicy
 from wpt_agents.replay import ReplayBuffer, mix
 from wpt_agents.rssm import Latent
@@ -163,9 +164,9 @@ class Updates:
         policy = self.policy
         with self._autocast():
             dream = policy.dream(start, self.imagine_horizon, generator)
-            feat = dream.states.feat
+            states = dream.states.steps()
             reward = self._imagined_reward(dream)
-            value = policy.target_critic.value(feat)
+            value = over_steps(policy.target_critic.value, states)
             returns = lambda_return(reward, value, self.gamma, self.lam)
             spread = scale = torch.ones_like(policy.return_scale)
             if self.return_norm:
@@ -175,7 +176,7 @@ class Updates:
         actor_norm = self._descend(self.actor_optimizer, loss + imitation, "actor")
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():
-            logits = policy.critic(feat[:, :-1].detach())
+            logits = over_steps(policy.critic, [state.detach() for state in states[:-1]])
             value_loss = critic_loss(logits, returns, self.gamma)
         critic_norm = self._descend(self.critic_optimizer, value_loss, "critic")
         ema_update(policy.target_critic, policy.critic, self.target_fraction)
@@ -196,7 +197,7 @@ class Updates:
         """(N, H): what arriving in the imagined states 0 .. H-1 pays."""
         model = self.policy.world_model
         with frozen(model):
-            return model.reward(dream.states.feat[:, :-1])
+            return over_steps(model.reward, dream.states.steps()[:-1])
 
     def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
         """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
@@ -234,6 +235,17 @@ class Updates:
     def _generator(self, purpose: int, counter: int) -> Generator:
         seed = torch_seed(self._stream(purpose, counter))
         return Generator(self.device).manual_seed(seed)
+
+
+def over_steps(head: Callable[[Tensor], Tensor], states: list[Latent]) -> Tensor:
+    """What a head makes of the states of H steps, (N, ...) each: (N, H, ...).
+
+    All at once, or on a CPU step by step where that is too large: see `networks.in_pieces`.
+    """
+    feats = [state.feat for state in states]
+    if feats[0].device.type == "cpu" and len(feats) * feats[0].numel() > PIECE:
+        return torch.stack([head(feat) for feat in feats], 1)
+    return head(torch.stack(feats, 1))
 
 
 def note(metrics: dict[str, list[Tensor]], loss: WorldModelLoss, norm: Tensor) -> None:

@@ -66,21 +66,26 @@ def measured_in_turn(
 ) -> list[dict[str, Any]]:
     """A row for each of several steps, which take turns with the ceiling: time, work, memory.
 
+    With several threads a step takes turns with itself on one, too: `times_one_thread`.
+
     :param counted: the like of the steps for counting their work, which compiled code hides
     """
-    steps = [step for step, _ in cases]
+    steps, threads = [step for step, _ in cases], torch.get_num_threads()
     work = [gflop(step) for step in counted or steps]
     held = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    *times, limiting = seconds_in_turn([*steps, matmul(device=device)], repetitions, warmup=1)
+    alone = [on_one_thread(step) for step in steps] if threads > 1 else []
+    limiting, *times = seconds_in_turn([matmul(device=device), *steps, *alone], repetitions)
     limit = matmul_gflop() / cost(*limiting)
     rows = []
-    for (_, about), (processor, wall), flops, peak in zip(cases, times, work, held, strict=True):
+    for i, (_, about) in enumerate(cases):
+        (processor, wall), flops, peak = times[i], work[i], held[i]
         median = cost(processor, wall)
+        faster = {"times_one_thread": times[len(cases) + i][1] / wall} if alone else {}
         rows.append(
             {
                 **about,
-                "threads": torch.get_num_threads(),
+                "threads": threads,
                 "median_s": median,
                 "wall_s": wall,
                 "gflop": flops,
@@ -88,9 +93,24 @@ def measured_in_turn(
                 "ceiling_gflop_per_s": limit,
                 "share_of_ceiling": flops / median / limit,
                 "rss_mb": peak,
+                **faster,
             }
         )
     return rows
+
+
+def on_one_thread(step: Callable[[], Any]) -> Callable[[], None]:
+    """The step with a single thread of torch."""
+
+    def alone() -> None:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            step()
+        finally:
+            torch.set_num_threads(threads)
+
+    return alone
 
 
 def _peak_mb(step: Callable[[], Any]) -> float:

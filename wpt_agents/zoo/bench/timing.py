@@ -71,8 +71,8 @@ def matmul_gflop() -> float:
 def gflop(step: Callable[[], Any]) -> float:
     """The multiplications and additions of one call, forward and backward, in units of 1e9.
 
-    A transposed convolution counts as its definition, not as the larger padded convolution that
-    computes it here; what is not matmul or convolution counts nothing.
+    A transposed convolution and a product of matrices count as what they are, not as the
+    convolutions that compute them here; what is not matmul or convolution counts nothing.
     """
     counter = FlopCounterMode(display=False)
     # its own walks through the modules, some of which mind
@@ -100,6 +100,7 @@ def _by_definition() -> Iterator[None]:
         patch.object(UpConv, "forward", plain),
         patch.object(UpConv, "parities", parities),
         patch.object(FromPixel, "forward", plain),
+        patch("wpt_agents.networks.by_convolution", lambda _: False),
     ):
         yield
 

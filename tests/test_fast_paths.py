@@ -31,7 +31,7 @@ def by_definition(patch):
     patch.setattr(networks.FromPixel, "forward", plain)
     patch.setattr(WorldModel, "reconstruction_error", error)
     patch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
-    patch.setattr(networks, "by_convolution", lambda rows: False)
+    patch.setattr(networks, "by_convolution", lambda *_: False)
     patch.setattr(updates, "over_steps", lambda head, states: head(feats(states)))
     patch.setattr(RSSM, "_scan", RSSM._filter)
     forward = BlockGRU.forward
@@ -54,6 +54,7 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
     monkeypatch.setattr(networks, "PIECE", 5 * 32 * 32 * 12)  # several pieces, one incomplete
     monkeypatch.setattr(updates, "PIECE", 5 * 32 * 32 * 12)  # less than the dreams have
     monkeypatch.setattr(networks, "MANY", 16)
+    monkeypatch.setattr(networks, "WORK", 0)
     monkeypatch.setattr(networks, "AVX512", True)  # whether or not it is there
     fast, after = three_updates()
     with monkeypatch.context() as patch:

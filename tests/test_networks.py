@@ -14,16 +14,15 @@ from wpt_agents.networks import (
     Head,
     ToPixels,
     UpConv,
-    as_image,
     block_linear,
     by_convolution,
     by_parity,
     frozen,
     interleaved,
     linear,
-    phases,
     to_uint8,
     to_unit,
+    upsampled,
 )
 
 DEBUG = SIZES["debug"]
@@ -56,20 +55,10 @@ def test_an_upconv_by_phases_is_the_transposed_convolution_on_the_way_back_too(k
     plain = torch.nn.functional.conv_transpose2d(*leaves, stride=2)
     weight = noise(*plain.shape, seed=1, dtype=torch.float64)
     expected = torch.autograd.grad((plain * weight).sum(), leaves)
-    image = as_image(phases(*leaves), kernel).permute(0, 3, 1, 2)  # as on a GPU
+    image = upsampled(*leaves)  # as on a GPU
     torch.testing.assert_close(image, plain, rtol=1e-12, atol=1e-12)
     found = torch.autograd.grad((image * weight).sum(), leaves)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-
-
-def test_the_gradients_of_parities_are_those_of_the_image():
-    layer, x = UpConv(3, 2, 6).double(), noise(2, 3, 4, 4, dtype=torch.float64).requires_grad_()
-    leaves = x, layer.weight, layer.bias
-    slope = noise(2, 6, 6, 8, dtype=torch.float64)
-    parities = torch.autograd.grad((layer.parities(x) * slope).sum(), leaves)
-    image = torch.autograd.grad((layer(x) * interleaved(slope).permute(0, 3, 1, 2)).sum(), leaves)
-    torch.testing.assert_close(parities, image, rtol=1e-12, atol=1e-12)
-    assert all(gradient.any() for gradient in parities)
 
 
 def test_pixels_by_parity_are_those_of_the_image():
@@ -99,6 +88,7 @@ def test_what_bfloat16_computes_otherwise_is_the_transposed_convolution_too(laye
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, bias, monkeypatch):
     monkeypatch.setattr(networks, "AVX512", True)  # the arithmetic is every CPU's
+    monkeypatch.setattr(networks, "WORK", 0)
     rows, inputs, outputs = 2 * networks.MANY, 12, 8
     wide = noise(rows, inputs + 3).requires_grad_()
     x = wide[:, 3:]  # as a head takes h and z from one tensor
@@ -106,7 +96,7 @@ def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, 
     bias = noise(outputs, seed=2).requires_grad_() if bias else None
     leaves = [wide, weight] + ([] if bias is None else [bias])
     plain = x @ torch.block_diag(*weight) + (0 if bias is None else bias)
-    assert by_convolution(x)
+    assert by_convolution(x, outputs)
     found = block_linear(x, weight, bias) if blocks > 1 else linear(x, weight[0].t(), bias)
     torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-5)
     slope = noise(rows, outputs, seed=3)
@@ -117,18 +107,20 @@ def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, 
     torch.testing.assert_close(in_time.flatten(0, 1), x @ noise(5, inputs).t())
 
 
-def test_which_rows_go_through_a_convolution(monkeypatch):
+def test_which_products_go_through_a_convolution(monkeypatch):
     monkeypatch.setattr(networks, "AVX512", True)
-    many = networks.MANY
-    assert by_convolution(noise(many, 3))
-    assert not by_convolution(noise(many - 16, 3))
-    assert not by_convolution(noise(many + 1, 3))  # 16 images of equally many pixels
-    assert not by_convolution(noise(many, 3, dtype=torch.float64))
-    assert not by_convolution(noise(many, 3).to("meta"))
+    rows, width = networks.MANY, networks.WORK // (networks.MANY * 64)
+    assert by_convolution(noise(rows, 64), width)
+    assert by_convolution(noise(4, rows // 4, 64), width)
+    assert not by_convolution(noise(rows, 64), width - 1)  # too little work
+    assert not by_convolution(noise(rows - 16, 64), 2 * width)
+    assert not by_convolution(noise(rows + 1, 64), width)  # 16 images of equally many pixels
+    assert not by_convolution(noise(rows, 64, dtype=torch.float64), width)
+    assert not by_convolution(noise(rows, 64).to("meta"), width)
     with torch.autocast("cpu", torch.bfloat16):  # whose products are oneDNN's anyway
-        assert not by_convolution(noise(many, 3))
+        assert not by_convolution(noise(rows, 64), width)
     monkeypatch.setattr(networks, "AVX512", False)
-    assert not by_convolution(noise(many, 3))
+    assert not by_convolution(noise(rows, 64), width)
 
 
 def test_a_downconv_of_a_single_image_is_the_strided_convolution():

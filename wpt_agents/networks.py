@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 NORM_EPS = 1e-3
 PIECE = 2**22  # numbers in the largest tensor that a stack of layers makes on a CPU: 16 MB
-MANY = 256  # rows from which on a product of matrices is worth a convolution
+MANY, WORK = 256, 2**22  # rows and multiplications from which on a convolution pays for a product
 IMAGES = 16  # of which a convolution takes these rows for the pixels
 AVX512 = torch.backends.mkldnn.is_available() and (
     torch.backends.cpu.get_cpu_capability() == "AVX512"
@@ -72,14 +72,14 @@ class ChannelNorm(nn.LayerNorm):
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The product x W^T + b: (..., inputs), (outputs, inputs) -> (..., outputs)."""
-    if not by_convolution(x):
+    if not by_convolution(x, len(weight)):
         return F.linear(x, weight, bias)
     return convolved(x.flatten(0, -2), weight, bias).unflatten(0, x.shape[:-1])
 
 
 def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The like by a block-diagonal W: (N, inputs), (b, inputs/b, outputs/b) -> (N, outputs)."""
-    if by_convolution(x):
+    if by_convolution(x, weight.shape[-1]):
         return convolved(x, weight.transpose(1, 2).flatten(0, 1), bias, len(weight))
     blocks = x.unflatten(-1, (len(weight), -1)).transpose(0, 1)
     if bias is None:
@@ -88,18 +88,22 @@ def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tenso
     return torch.baddbmm(bias, blocks, weight).transpose(0, 1).flatten(1)
 
 
-def by_convolution(x: Tensor) -> bool:
+def by_convolution(x: Tensor, width: int) -> bool:
     """Whether `convolved` is the quicker way: for many rows on a CPU with AVX-512, in float32.
 
     oneDNN's convolutions use these instructions wherever there are any. MKL's products of
     matrices, which are torch's, do without them on AMD's CPUs, at half the speed on the newest.
+
+    :param width: how many outputs each input has
     """
+    rows = x.shape[:-1].numel()
     return (
         AVX512
         and x.device.type == "cpu"
         and x.dtype == torch.float32
-        and x.shape[:-1].numel() >= MANY
-        and x.shape[:-1].numel() % IMAGES == 0
+        and rows >= MANY
+        and rows % IMAGES == 0
+        and x.numel() * width >= WORK
         and not torch.is_autocast_enabled("cpu")
     )
 
@@ -198,9 +202,6 @@ class Encoder(nn.Module):
         return self.layers(to_unit(image).permute(0, 3, 1, 2))  # channels_last in memory
 
 
-Form = Callable[[Tensor, int], Tensor]
-
-
 class UpConv(nn.ConvTranspose2d):
     """A transposed convolution of stride 2, computed as one 3x3 convolution and a pixel shuffle.
 
@@ -215,16 +216,13 @@ class UpConv(nn.ConvTranspose2d):
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # its size is no choice
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
-        return self._upsampled(x, as_image).permute(0, 3, 1, 2)
+        if x.device.type != "cpu" or in_bfloat16(x):
+            return upsampled(x, self.weight, self.bias)
+        return Upsample.apply(x, self.weight, self.bias)
 
     def parities(self, x: Tensor) -> Tensor:
         """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs), which `interleaved` makes an image."""
-        return self._upsampled(x, as_parities)
-
-    def _upsampled(self, x: Tensor, form: Form) -> Tensor:
-        if x.device.type != "cpu" or in_bfloat16(x):
-            return form(phases(x, self.weight, self.bias), self.kernel_size[0])
-        return Upsample.apply(form, x, self.weight, self.bias)
+        return phases(x, self.weight, self.bias)
 
 
 def phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -240,49 +238,46 @@ def phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return out.add_(bias.to(out.dtype))
 
 
+def upsampled(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """The image that `phases` are of: (N, outputs, 2H + K - 2, 2W + K - 2)."""
+    image = interleaved(phases(x, weight, bias))
+    image = image[:, :-1, :-1] if weight.shape[-1] % 2 else image
+    return image.permute(0, 3, 1, 2)
+
+
 class Upsample(torch.autograd.Function):
-    """There by `phases`, back as the transposed convolution: each way as it is quicker on a CPU."""
+    """There as `upsampled`, back as the transposed convolution: what is quicker on a CPU."""
 
     @staticmethod
-    def forward(ctx: Any, form: Form, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """What `form` makes of the phases."""
-        ctx.form = form
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """The image."""
         ctx.save_for_backward(x, weight)
-        return form(phases(x, weight, bias), weight.shape[-1])
+        return upsampled(x, weight, bias)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """The slopes of x, weight and bias."""
         x, weight = ctx.saved_tensors
-        if ctx.form is as_parities:
-            slope = as_image(slope, weight.shape[-1])
-        return None, *torch.ops.aten.convolution_backward(
-            slope.permute(0, 3, 1, 2),
-            *(x, weight, [weight.shape[1]], [2, 2], [0, 0], [1, 1], True, [0, 0], 1),
-            ctx.needs_input_grad[1:],
+        return torch.ops.aten.convolution_backward(
+            *(slope, x, weight, [weight.shape[1]], [2, 2], [0, 0], [1, 1], True, [0, 0], 1),
+            ctx.needs_input_grad,
         )
 
 
 class ToPixels(UpConv):
     """The last `UpConv`; on a CPU in float32 always, as bfloat16 takes longer for few channels."""
 
-    def _upsampled(self, x: Tensor, form: Form) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
+        """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
+        return interleaved(self.parities(x)).permute(0, 3, 1, 2)
+
+    def parities(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs)."""
         if not in_bfloat16(x):
-            return super()._upsampled(x, form)
+            return super().parities(x)
         with torch.autocast("cpu", enabled=False):
-            return super()._upsampled(x.float(), form)
-
-
-def as_image(parities: Tensor, kernel: int) -> Tensor:
-    """`interleaved`, less the row and the column that an odd kernel does not reach."""
-    image = interleaved(parities)
-    return image[:, :-1, :-1] if kernel % 2 else image
-
-
-def as_parities(parities: Tensor, kernel: int) -> Tensor:
-    """Left as they are."""
-    return parities
+            return super().parities(x.float())
 
 
 def interleaved(parities: Tensor) -> Tensor:

@@ -100,7 +100,7 @@ def _by_definition() -> Iterator[None]:
         patch.object(UpConv, "forward", plain),
         patch.object(UpConv, "parities", parities),
         patch.object(FromPixel, "forward", plain),
-        patch("wpt_agents.networks.by_convolution", lambda _: False),
+        patch("wpt_agents.networks.by_convolution", lambda *_: False),
     ):
         yield
 

@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from unittest.mock import patch
 
-from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from wpt_agents.networks import Form, UpConv, phases
+from wpt_agents.networks import UpConv, upsampled
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
 from wpt_agents.zoo.bench.timing import gflop
 
@@ -42,15 +41,11 @@ def _calls(length: int) -> dict[str, int]:
     model, data = agent("debug"), synthetic_batch(1, length)
     rssm = model.policy.world_model.rssm
     rssm._scan = rssm._filter  # type: ignore[method-assign]
-    with patch.object(UpConv, "_upsampled", _by_phases):
+    with patch.object(UpConv, "forward", lambda up, x: upsampled(x, up.weight, up.bias)):
         return {
             "world model": launches(world_model_step(model, data)),
             "whole update": launches(whole_step(model, data)),
         }
-
-
-def _by_phases(layer: UpConv, x: Tensor, form: Form) -> Tensor:
-    return form(phases(x, layer.weight, layer.bias), layer.kernel_size[0])
 
 
 def launches(step: Callable[[], Any]) -> int:

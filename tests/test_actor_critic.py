@@ -6,6 +6,7 @@ import pytest
 import torch
 from chain import chain
 
+from wpt_agents import updates
 from wpt_agents.actor_critic import (
     Actor,
     Critic,
@@ -324,3 +325,22 @@ def test_the_same_seed_learns_the_same_numbers():
             model.update(metrics)
         losses.append({name: torch.stack(values).tolist() for name, values in metrics.items()})
     assert losses[0] == losses[1]
+
+
+def test_a_head_sees_the_steps_of_a_dream_alike_at_once_and_one_by_one(monkeypatch):
+    states = Latent(noise(4, 3, 5).requires_grad_(), noise(4, 3, 2, 2, seed=1).requires_grad_())
+    torch.manual_seed(0)
+    net, seen = torch.nn.Linear(9, 2), []
+
+    def head(feat):
+        seen.append(feat.shape)
+        return net(feat)
+
+    def outcome():
+        out = updates.over_steps(head, states)
+        return out, torch.autograd.grad(out, [*states, net.weight], noise(4, 3, 2, seed=2))
+
+    at_once = outcome()
+    monkeypatch.setattr(updates, "PIECE", 4 * 3 * 9 - 1)  # one less than there are
+    torch.testing.assert_close(outcome(), at_once)
+    assert seen == [(4, 3, 9), *3 * [(4, 9)]]

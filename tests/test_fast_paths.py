@@ -22,20 +22,23 @@ def error(model, latent, image):
     return squared_error(networks.to_unit(image), model.decode(latent))
 
 
-def feats(states):
-    return torch.stack([state.feat for state in states], 1)
-
-
 def by_definition(patch):
     patch.setattr(networks.UpConv, "forward", plain)
+    patch.setattr(networks.ToPixels, "forward", plain)
     patch.setattr(networks.FromPixel, "forward", plain)
     patch.setattr(WorldModel, "reconstruction_error", error)
     patch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
     patch.setattr(networks, "by_convolution", lambda *_: False)
-    patch.setattr(updates, "over_steps", lambda head, states: head(feats(states)))
+    patch.setattr(updates, "over_steps", lambda head, states: head(states.feat))
     patch.setattr(RSSM, "_scan", RSSM._filter)
     forward = BlockGRU.forward
     patch.setattr(BlockGRU, "forward", lambda self, h, z, a, shared=None: forward(self, h, z, a))
+
+
+def as_of_many_rows(patch):
+    patch.setattr(networks, "MANY", 16)
+    patch.setattr(networks, "WORK", 0)
+    patch.setattr(networks, "AMD_AVX512", True)  # whether or not it is
 
 
 def three_updates(backend=None):
@@ -50,13 +53,22 @@ def three_updates(backend=None):
     return {k: torch.stack(v) for k, v in metrics.items()}, weights(model)
 
 
+def seen(function, calls):
+    def call(*arguments):
+        calls.append(arguments)
+        return function(*arguments)
+
+    return call
+
+
 def test_three_updates_are_those_of_the_definition(monkeypatch):
     monkeypatch.setattr(networks, "PIECE", 5 * 32 * 32 * 12)  # several pieces, one incomplete
-    monkeypatch.setattr(updates, "PIECE", 5 * 32 * 32 * 12)  # less than the dreams have
-    monkeypatch.setattr(networks, "MANY", 16)
-    monkeypatch.setattr(networks, "WORK", 0)
-    monkeypatch.setattr(networks, "AVX512", True)  # whether or not it is there
+    monkeypatch.setattr(updates, "PIECE", 1)  # the heads see the dreams step by step
+    as_of_many_rows(monkeypatch)
+    taken = []
+    monkeypatch.setattr(networks, "convolved", seen(networks.convolved, taken))
     fast, after = three_updates()
+    assert taken
     with monkeypatch.context() as patch:
         by_definition(patch)
         slow, expected = three_updates()
@@ -71,6 +83,7 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # at which torch looks
 def test_three_compiled_updates_are_those_of_the_definition(monkeypatch):
     monkeypatch.setattr(RSSM, "_scan", RSSM._filter)  # the way of a GPU
+    as_of_many_rows(monkeypatch)  # what can be compiled of a CPU's way
     expected, after = three_updates()
     graphs = []
 

@@ -34,7 +34,11 @@ def noise(*shape, seed=0, dtype=torch.float32):
 
 @pytest.mark.parametrize(
     ("layer", "kernel", "width"),
-    [(FromPixel, 5, 1), *((UpConv, kernel, width) for kernel in (5, 6) for width in (1, 4, 13))],
+    [
+        (FromPixel, 5, 1),
+        (ToPixels, 6, 4),
+        *((UpConv, kernel, width) for kernel in (5, 6) for width in (1, 4, 13)),
+    ],
 )
 def test_an_upconv_is_the_transposed_convolution_gradients_too(layer, kernel, width):
     ours = layer(3, 2, kernel).double()
@@ -55,7 +59,7 @@ def test_an_upconv_by_phases_is_the_transposed_convolution_on_the_way_back_too(k
     plain = torch.nn.functional.conv_transpose2d(*leaves, stride=2)
     weight = noise(*plain.shape, seed=1, dtype=torch.float64)
     expected = torch.autograd.grad((plain * weight).sum(), leaves)
-    image = upsampled(*leaves)  # as on a GPU
+    image = upsampled(*leaves)  # as in bfloat16
     torch.testing.assert_close(image, plain, rtol=1e-12, atol=1e-12)
     found = torch.autograd.grad((image * weight).sum(), leaves)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
@@ -84,10 +88,17 @@ def test_what_bfloat16_computes_otherwise_is_the_transposed_convolution_too(laye
         assert (a - b).abs().max() < 0.02 * b.abs().max()
 
 
+def ran(step):
+    """The operators that a step called."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        step()
+    return {row.key.removeprefix("aten::") for row in profile.key_averages()}
+
+
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, bias, monkeypatch):
-    monkeypatch.setattr(networks, "AVX512", True)  # the arithmetic is every CPU's
+    monkeypatch.setattr(networks, "AMD_AVX512", True)  # the arithmetic is every CPU's
     monkeypatch.setattr(networks, "WORK", 0)
     rows, inputs, outputs = 2 * networks.MANY, 12, 8
     wide = noise(rows, inputs + 3).requires_grad_()
@@ -96,8 +107,9 @@ def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, 
     bias = noise(outputs, seed=2).requires_grad_() if bias else None
     leaves = [wide, weight] + ([] if bias is None else [bias])
     plain = x @ torch.block_diag(*weight) + (0 if bias is None else bias)
-    assert by_convolution(x, outputs)
     found = block_linear(x, weight, bias) if blocks > 1 else linear(x, weight[0].t(), bias)
+    assert "convolution" in ran(lambda: block_linear(x, weight, bias))
+    assert "convolution" in ran(lambda: linear(x, weight.new_ones(5, inputs)))
     torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-5)
     slope = noise(rows, outputs, seed=3)
     expected = torch.autograd.grad(plain, leaves, slope)
@@ -108,7 +120,7 @@ def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, 
 
 
 def test_which_products_go_through_a_convolution(monkeypatch):
-    monkeypatch.setattr(networks, "AVX512", True)
+    monkeypatch.setattr(networks, "AMD_AVX512", True)
     rows, width = networks.MANY, networks.WORK // (networks.MANY * 64)
     assert by_convolution(noise(rows, 64), width)
     assert by_convolution(noise(4, rows // 4, 64), width)
@@ -119,7 +131,7 @@ def test_which_products_go_through_a_convolution(monkeypatch):
     assert not by_convolution(noise(rows, 64).to("meta"), width)
     with torch.autocast("cpu", torch.bfloat16):  # whose products are oneDNN's anyway
         assert not by_convolution(noise(rows, 64), width)
-    monkeypatch.setattr(networks, "AVX512", False)
+    monkeypatch.setattr(networks, "AMD_AVX512", False)
     assert not by_convolution(noise(rows, 64), width)
 
 

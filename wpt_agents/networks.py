@@ -2,9 +2,11 @@
 
 import itertools
 import math
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,8 +18,18 @@ NORM_EPS = 1e-3
 PIECE = 2**22  # numbers in the largest tensor that a stack of layers makes on a CPU: 16 MB
 MANY, WORK = 256, 2**22  # rows and multiplications from which on a convolution pays for a product
 IMAGES = 16  # of which a convolution takes these rows for the pixels
-AVX512 = torch.backends.mkldnn.is_available() and (
-    torch.backends.cpu.get_cpu_capability() == "AVX512"
+
+
+def cpu_model() -> str:
+    """What the system says of the processor, its maker among it."""
+    told = Path("/proc/cpuinfo")
+    return told.read_text() if told.exists() else platform.processor()
+
+
+AMD_AVX512 = (
+    torch.backends.mkldnn.is_available()
+    and torch.backends.cpu.get_cpu_capability() == "AVX512"
+    and "AuthenticAMD" in cpu_model()
 )
 
 
@@ -79,6 +91,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The like by a block-diagonal W: (N, inputs), (b, inputs/b, outputs/b) -> (N, outputs)."""
+    assert x.dim() == 2, x.shape
     if by_convolution(x, weight.shape[-1]):
         return convolved(x, weight.transpose(1, 2).flatten(0, 1), bias, len(weight))
     blocks = x.unflatten(-1, (len(weight), -1)).transpose(0, 1)
@@ -89,7 +102,7 @@ def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tenso
 
 
 def by_convolution(x: Tensor, width: int) -> bool:
-    """Whether `convolved` is the quicker way: for many rows on a CPU with AVX-512, in float32.
+    """Whether `convolved` is the quicker way: for many rows in float32 on AMD's AVX-512.
 
     oneDNN's convolutions use these instructions wherever there are any. MKL's products of
     matrices, which are torch's, do without them on AMD's CPUs, at half the speed on the newest.
@@ -98,7 +111,7 @@ def by_convolution(x: Tensor, width: int) -> bool:
     """
     rows = x.shape[:-1].numel()
     return (
-        AVX512
+        AMD_AVX512
         and x.device.type == "cpu"
         and x.dtype == torch.float32
         and rows >= MANY
@@ -203,7 +216,7 @@ class Encoder(nn.Module):
 
 
 class UpConv(nn.ConvTranspose2d):
-    """A transposed convolution of stride 2, computed as one 3x3 convolution and a pixel shuffle.
+    """A transposed convolution of stride 2; on a CPU as one 3x3 convolution and a pixel shuffle.
 
     An output pixel (2i + p, 2j + q) sees the kernel's entries of parity (p, q) only, so the four
     parities are four ordinary convolutions of the input, here done at once. Exactly the same sums.
@@ -212,13 +225,15 @@ class UpConv(nn.ConvTranspose2d):
     bias: Tensor
 
     def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
+        assert kernel in (5, 6), kernel
         super().__init__(inputs, outputs, kernel, stride=2)
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # its size is no choice
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
-        if x.device.type != "cpu" or in_bfloat16(x):
-            return upsampled(x, self.weight, self.bias)
-        return Upsample.apply(x, self.weight, self.bias)
+        if x.device.type != "cpu":
+            return F.conv_transpose2d(x, self.weight, self.bias, stride=2)
+        up = upsampled if in_bfloat16(x) else Upsample.apply
+        return up(x, self.weight, self.bias)
 
     def parities(self, x: Tensor) -> Tensor:
         """(N, inputs, H, W) -> (N, H + 2, W + 2, 4 outputs), which `interleaved` makes an image."""
@@ -266,7 +281,10 @@ class Upsample(torch.autograd.Function):
 
 
 class ToPixels(UpConv):
-    """The last `UpConv`; on a CPU in float32 always, as bfloat16 takes longer for few channels."""
+    """The last `UpConv`; both ways by phases, as its image is compared in their order.
+
+    On a CPU in float32 always, as bfloat16 takes longer for few channels.
+    """
 
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # as in `UpConv`
         """(N, inputs, H, W) -> (N, outputs, 2H + K - 2, 2W + K - 2)."""
@@ -397,6 +415,7 @@ def in_pieces(layers: Callable[..., Tensor], largest: int, *inputs: Tensor) -> T
     :param largest: the numbers that a row has where it has most
     """
     rows = max(1, PIECE // largest)
+    rows -= rows % IMAGES if rows > IMAGES else 0  # see `by_convolution`
     if inputs[0].device.type != "cpu" or len(inputs[0]) <= rows:
         return layers(*inputs)
     pieces = zip(*(x.split(rows) for x in inputs), strict=True)

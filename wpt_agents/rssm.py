@@ -39,6 +39,10 @@ class Latent(NamedTuple):
         """(N, H, ...) -> H times (N, ...)."""
         return [Latent(*step) for step in zip(*(x.unbind(1) for x in self), strict=True)]
 
+    def but_last(self) -> "Latent":
+        """(N, H + 1, ...) -> (N, H, ...)."""
+        return Latent(self.deter[:, :-1], self.stoch[:, :-1])
+
     def flatten_time(self) -> "Latent":
         """(B, T, ...) -> (B*T, ...)."""
         return Latent(self.deter.flatten(0, 1), self.stoch.flatten(0, 1))

@@ -164,9 +164,8 @@ class Updates:
         policy = self.policy
         with self._autocast():
             dream = policy.dream(start, self.imagine_horizon, generator)
-            states = dream.states.steps()
             reward = self._imagined_reward(dream)
-            value = over_steps(policy.target_critic.value, states)
+            value = over_steps(policy.target_critic.value, dream.states)
             returns = lambda_return(reward, value, self.gamma, self.lam)
             spread = scale = torch.ones_like(policy.return_scale)
             if self.return_norm:
@@ -176,7 +175,7 @@ class Updates:
         actor_norm = self._descend(self.actor_optimizer, loss + imitation, "actor")
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():
-            logits = over_steps(policy.critic, [state.detach() for state in states[:-1]])
+            logits = over_steps(policy.critic, dream.states.detach().but_last())
             value_loss = critic_loss(logits, returns, self.gamma)
         critic_norm = self._descend(self.critic_optimizer, value_loss, "critic")
         ema_update(policy.target_critic, policy.critic, self.target_fraction)
@@ -197,7 +196,7 @@ class Updates:
         """(N, H): what arriving in the imagined states 0 .. H-1 pays."""
         model = self.policy.world_model
         with frozen(model):
-            return over_steps(model.reward, dream.states.steps()[:-1])
+            return over_steps(model.reward, dream.states.but_last())
 
     def _descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
         """One optimiser step; refuses a loss or gradient that is not finite, keeping the weights.
@@ -237,15 +236,15 @@ class Updates:
         return Generator(self.device).manual_seed(seed)
 
 
-def over_steps(head: Callable[[Tensor], Tensor], states: list[Latent]) -> Tensor:
-    """What a head makes of the states of H steps, (N, ...) each: (N, H, ...).
+def over_steps(head: Callable[[Tensor], Tensor], states: Latent) -> Tensor:
+    """What a head makes of the features of N states at H steps: (N, H, ...).
 
     All at once, or on a CPU step by step where that is too large: see `networks.in_pieces`.
     """
-    feats = [state.feat for state in states]
-    if feats[0].device.type == "cpu" and len(feats) * feats[0].numel() > PIECE:
-        return torch.stack([head(feat) for feat in feats], 1)
-    return head(torch.stack(feats, 1))
+    deter, stoch = states
+    if deter.device.type != "cpu" or deter.numel() + stoch.numel() <= PIECE:
+        return head(states.feat)
+    return torch.stack([head(state.feat) for state in states.steps()], 1)
 
 
 def note(metrics: dict[str, list[Tensor]], loss: WorldModelLoss, norm: Tensor) -> None:

@@ -30,7 +30,7 @@ def bench(
     quick: Annotated[bool, typer.Option(help="Seconds: does it run? The numbers mean little.")] = (
         False
     ),
-    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="Of torch; several take turns with one.")] = 1,
     precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
     compiled: Annotated[
         bool, typer.Option("--compile", help="Of model: scan and dream by torch.compile; minutes.")

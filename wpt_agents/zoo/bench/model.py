@@ -16,6 +16,7 @@ from wpt_agents.zoo.bench.timing import (
     gflop,
     matmul,
     matmul_gflop,
+    onednn,
     peak_rss_mb,
     seconds_in_turn,
 )
@@ -66,7 +67,7 @@ def measured_in_turn(
 ) -> list[dict[str, Any]]:
     """A row for each of several steps, which take turns with the ceiling: time, work, memory.
 
-    With several threads a step takes turns with itself on one, too: `times_one_thread`.
+    With several threads of a CPU a step takes turns with itself on one, too: `times_one_thread`.
 
     :param counted: the like of the steps for counting their work, which compiled code hides
     """
@@ -74,9 +75,12 @@ def measured_in_turn(
     work = [gflop(step) for step in counted or steps]
     held = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    alone = [on_one_thread(step) for step in steps] if threads > 1 else []
-    limiting, *times = seconds_in_turn([matmul(device=device), *steps, *alone], repetitions)
-    limit = matmul_gflop() / cost(*limiting)
+    alone = [on_one_thread(step) for step in steps] if threads > 1 and device == "cpu" else []
+    limits = {"ceiling_gflop_per_s": matmul(device=device)}
+    limits |= {"onednn_gflop_per_s": onednn()} if device == "cpu" else {}
+    found = seconds_in_turn([*limits.values(), *steps, *alone], repetitions)
+    rates = {name: matmul_gflop() / cost(*took) for name, took in zip(limits, found, strict=False)}
+    times = found[len(limits) :]
     rows = []
     for i, (_, about) in enumerate(cases):
         (processor, wall), flops, peak = times[i], work[i], held[i]
@@ -90,8 +94,8 @@ def measured_in_turn(
                 "wall_s": wall,
                 "gflop": flops,
                 "gflop_per_s": flops / median,
-                "ceiling_gflop_per_s": limit,
-                "share_of_ceiling": flops / median / limit,
+                "share_of_ceiling": flops / median / rates["ceiling_gflop_per_s"],
+                **rates,
                 "rss_mb": peak,
                 **faster,
             }

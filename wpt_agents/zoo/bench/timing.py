@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from wpt_agents.networks import FromPixel, UpConv, by_parity
+from wpt_agents.networks import FromPixel, UpConv, by_parity, convolved
 
 SIDE = 1024  # of the matrices whose product is the ceiling
 MATMULS = 5  # in a row, so that a turn of them takes about a tenth of a second
@@ -58,13 +58,22 @@ def _wait() -> None:
 
 
 def matmul(device: str = "cpu") -> Callable[[], Any]:
-    """`MATMULS` products of two square matrices: the ceiling, no network does more a second."""
+    """`MATMULS` products of two square matrices by torch: what is called the ceiling.
+
+    On AMD's CPUs with AVX-512 it is none: see `networks.by_convolution`, and `onednn`.
+    """
     a, b = (torch.randn(SIDE, SIDE).to(device) for _ in range(2))
     return lambda: [a @ b for _ in range(MATMULS)]
 
 
+def onednn() -> Callable[[], Any]:
+    """The same products as convolutions, which are oneDNN's on a CPU."""
+    a, b = (torch.randn(SIDE, SIDE) for _ in range(2))
+    return lambda: [convolved(a, b) for _ in range(MATMULS)]
+
+
 def matmul_gflop() -> float:
-    """The work of `matmul`."""
+    """The work of `matmul`, and of `onednn`."""
     return MATMULS * 2 * SIDE**3 / 1e9
 
 
@@ -88,11 +97,13 @@ class _Everything(nullcontext):
     parents = ("Global",)
 
 
+def plain(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
+    """An `UpConv` by torch's own operator, as on a GPU."""
+    return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
+
+
 @contextmanager
 def _by_definition() -> Iterator[None]:
-    def plain(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
-        return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
-
     def parities(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
         return by_parity(plain(layer, x).permute(0, 2, 3, 1))
 

@@ -6,9 +6,9 @@ from unittest.mock import patch
 
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from wpt_agents.networks import UpConv, upsampled
+from wpt_agents.networks import UpConv
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
-from wpt_agents.zoo.bench.timing import gflop
+from wpt_agents.zoo.bench.timing import gflop, plain
 
 BATCH, LENGTH = 16, 64  # the work is told for these, counted on less and multiplied
 COUNTED = 1, 4
@@ -41,7 +41,10 @@ def _calls(length: int) -> dict[str, int]:
     model, data = agent("debug"), synthetic_batch(1, length)
     rssm = model.policy.world_model.rssm
     rssm._scan = rssm._filter  # type: ignore[method-assign]
-    with patch.object(UpConv, "forward", lambda up, x: upsampled(x, up.weight, up.bias)):
+    with (
+        patch.object(UpConv, "forward", plain),
+        patch("wpt_agents.networks.by_convolution", lambda *_: False),
+    ):
         return {
             "world model": launches(world_model_step(model, data)),
             "whole update": launches(whole_step(model, data)),

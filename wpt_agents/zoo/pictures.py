@@ -55,7 +55,7 @@ def learning_curve(
     axes.set(title=title, xlabel="simulator frames", ylabel="episode return")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, loc="best")
+    axes.legend(edgecolor="none", framealpha=0.9, loc="best")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

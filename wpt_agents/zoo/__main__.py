@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from wpt_agents.zoo import data_commands
 from wpt_agents.zoo.bench.command import bench
-from wpt_agents.zoo.options import Settings, Spaced, Suite, Tasks, Workers, print_table
+from wpt_agents.zoo.commands import data as data_commands
+from wpt_agents.zoo.commands.options import Settings, Spaced, Suite, Tasks, Workers, print_table
 from wpt_agents.zoo.report.command import report
 
 app = typer.Typer(
@@ -46,10 +46,10 @@ def list_tasks(
     from rich.table import Table
     from wpt_envs.tasks import TASKS
 
-    from wpt_agents.names import unknown_name
-    from wpt_agents.zoo.plan import METHODS
-    from wpt_agents.zoo.presets import preset_names, suite_names
-    from wpt_agents.zoo.stages import console
+    from wpt_agents.files.names import unknown_name
+    from wpt_agents.zoo.plan.plan import METHODS
+    from wpt_agents.zoo.plan.presets import preset_names, suite_names
+    from wpt_agents.zoo.run.stages import console
 
     suites = list(dict.fromkeys(row.suite for row in TASKS.values()))
     if suite and suite not in suites:
@@ -85,10 +85,10 @@ def pretrain_model(
 
     On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
-    from wpt_agents.distributed import joined, local_device
+    from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device
-    from wpt_agents.zoo.presets import load_preset
-    from wpt_agents.zoo.stages import Shared, console
+    from wpt_agents.zoo.plan.presets import load_preset
+    from wpt_agents.zoo.run.stages import Shared, console
 
     check_device(device)
     chosen = load_preset(suite, preset, settings)
@@ -152,13 +152,13 @@ def run_benchmark(
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
-    from wpt_agents.distributed import started_by_torchrun
-    from wpt_agents.zoo.benchmark import check_folder, run_all
-    from wpt_agents.zoo.engines import Resources, run_on
-    from wpt_agents.zoo.estimate import check_space, summary
+    from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.machine import check_machine
-    from wpt_agents.zoo.plan import make_plan, show_plan
-    from wpt_agents.zoo.watch import watch as show_standings
+    from wpt_agents.zoo.plan.estimate import check_space, summary
+    from wpt_agents.zoo.plan.plan import make_plan, show_plan
+    from wpt_agents.zoo.run.benchmark import check_folder, run_all
+    from wpt_agents.zoo.run.engines import Resources, run_on
+    from wpt_agents.zoo.run.watch import watch as show_standings
 
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
@@ -207,8 +207,8 @@ def evaluate_model(
 
     Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
     """
+    from wpt_agents.zoo.collect.trained import find_trained
     from wpt_agents.zoo.report.tables import interval_text, number
-    from wpt_agents.zoo.trained import find_trained
 
     trained = find_trained(run, task)
     score = trained.evaluate(trained.load(policy, device), episodes, seed)
@@ -235,8 +235,8 @@ def enjoy_model(
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
+    from wpt_agents.zoo.collect.trained import find_trained
     from wpt_agents.zoo.report.tables import number
-    from wpt_agents.zoo.trained import find_trained
 
     if size % 16:
         raise ValueError(f"--size {size}: a video's width must be a multiple of 16.")
@@ -258,8 +258,8 @@ def diagnose_model(
 
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
-    from wpt_agents.zoo.diagnosis import diagnose, show
-    from wpt_agents.zoo.trained import find_trained
+    from wpt_agents.zoo.collect.trained import find_trained
+    from wpt_agents.zoo.judge.diagnosis import diagnose, show
 
     show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
 
@@ -282,9 +282,9 @@ def judge_predictions(
 
     Example: `python -m wpt_agents.zoo open-loop walker.zip data/held-out --out predictions`
     """
-    from wpt_agents.dataset import TrajectoryDataset
-    from wpt_agents.wpt import WPT
-    from wpt_agents.zoo.prediction import judge
+    from wpt_agents.agents.wpt import WPT
+    from wpt_agents.data.dataset import TrajectoryDataset
+    from wpt_agents.zoo.judge.prediction import judge
 
     file = model / "model.zip" if model.is_dir() else model
     rows = judge(WPT.load(file, device=device), TrajectoryDataset.open(data), episodes, out)
@@ -303,7 +303,7 @@ def push_run(
 
     Log in first: `hf auth login`.
     """
-    from wpt_agents.zoo.hub import push
+    from wpt_agents.zoo.run.hub import push
 
     typer.echo(f"Pushed: {push(run, name, private)}")
 
@@ -316,7 +316,7 @@ def pull_run(
     ),
 ) -> None:
     """Downloads a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`."""
-    from wpt_agents.zoo.hub import pull
+    from wpt_agents.zoo.run.hub import pull
 
     folder = pull(name, out or Path(name.rpartition("/")[2]))
     typer.echo(f"Pulled: {folder.resolve()}. Watch it: python -m wpt_agents.zoo enjoy {folder}")

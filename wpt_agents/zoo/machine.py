@@ -5,7 +5,7 @@ from types import ModuleType
 
 import torch
 
-from wpt_agents.names import unknown_name
+from wpt_agents.files.names import unknown_name
 
 ENGINES = {"none": "", "local": "", "ray": "ray", "slurm": "submitit"}  # and their packages
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from wpt_agents.zoo.options import print_table
+from wpt_agents.zoo.commands.options import print_table
 
 Case = StrEnum(
     "Case",

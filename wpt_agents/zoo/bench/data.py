@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.trajectory import Trajectory
-from wpt_agents.windows import Windows
-from wpt_agents.wpt import WPT
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.windows import Windows
 from wpt_agents.zoo.bench.formats import FORMATS, Read, store
 from wpt_agents.zoo.bench.timing import memory_mib
-from wpt_agents.zoo.collect import collect
-from wpt_agents.zoo.workers import worker_pool
+from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.collect.workers import worker_pool
 
 Rows = Iterator[dict[str, Any]]
 BATCH = 16, 64  # Table 2's

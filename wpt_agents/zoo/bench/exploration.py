@@ -13,9 +13,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from wpt_agents.exploration import EXPLORE, EXPLORERS
-from wpt_agents.zoo.behaviours import Act, noise_actions, random_actions
-from wpt_agents.zoo.collect import record
+from wpt_agents.agents.curious import EXPLORE, EXPLORERS
+from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions
+from wpt_agents.zoo.collect.collect import record
 
 TASK = "wpt/dmc-walker-stand-v0"
 BEHAVIOURS = ("random", "noise", "icm", "plan2explore")

@@ -13,8 +13,8 @@ from unittest import mock
 
 import numpy as np
 
-from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.trajectory import Trajectory
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.trajectory import Trajectory
 
 Read = Callable[[int, int, int], np.ndarray]
 """(trajectory, first image, one past the last) -> images"""

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from wpt_agents.trajectory import Batch
-from wpt_agents.updates import UPDATE
-from wpt_agents.wpt import WPT
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.trajectory import Batch
+from wpt_agents.training.updates import UPDATE
 from wpt_agents.zoo.bench.timing import (
     cost,
     forget_peak,

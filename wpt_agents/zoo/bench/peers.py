@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
 
-from wpt_agents.networks import SIZES, Size
-from wpt_agents.trajectory import Batch
-from wpt_agents.wpt import WPT
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.trajectory import Batch
+from wpt_agents.model.networks import SIZES, Size
 from wpt_agents.zoo.bench.model import (
     ACTIONS,
     agent,
@@ -30,7 +30,7 @@ from wpt_agents.zoo.bench.model import (
     whole_step,
     world_model_step,
 )
-from wpt_agents.zoo.engines import import_extra
+from wpt_agents.zoo.run.engines import import_extra
 
 REPETITIONS = 3
 HORIZON = 15  # imagined steps in the peers' own configurations

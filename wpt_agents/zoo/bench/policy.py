@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from wpt_agents.policy import WPTPolicy
+from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.zoo.bench.model import agent, count
 from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds_in_turn
 

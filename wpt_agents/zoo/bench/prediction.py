@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from wpt_agents.archive import replacing
-from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.wpt import WPT
-from wpt_agents.zoo.collect import collect
-from wpt_agents.zoo.prediction import (
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.judge.prediction import (
     MeanFrame,
     Predict,
     compare,

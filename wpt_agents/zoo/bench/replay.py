@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 
-from wpt_agents.replay import ReplayBuffer
-from wpt_agents.trajectory import Trajectory
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.bench.timing import memory_mib, seconds
 
 LENGTH, ACTIONS = 500, 6

@@ -14,12 +14,12 @@ import gymnasium as gym
 import numpy as np
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.dataset import TrajectoryDataset
-from wpt_agents.retrieval import Retriever
-from wpt_agents.wpt import WPT
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.retrieval import Retriever
 from wpt_agents.zoo.bench.timing import memory_mib
-from wpt_agents.zoo.collect import collect
-from wpt_agents.zoo.workers import worker_pool
+from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.collect.workers import worker_pool
 
 FOLDER = Path("runs") / "bench" / "retrieval"
 DMC = ("cartpole-swingup", "acrobot-swingup", "cheetah-run", "walker-run", "quadruped-run")

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from wpt_agents.networks import FromPixel, UpConv, by_parity, convolved
+from wpt_agents.model.networks import FromPixel, UpConv, by_parity, convolved
 
 SIDE = 1024  # of the matrices whose product is the ceiling
 MATMULS = 5  # in a row, so that a turn of them takes about a tenth of a second
@@ -111,7 +111,7 @@ def _by_definition() -> Iterator[None]:
         patch.object(UpConv, "forward", plain),
         patch.object(UpConv, "parities", parities),
         patch.object(FromPixel, "forward", plain),
-        patch("wpt_agents.networks.by_convolution", lambda *_: False),
+        patch("wpt_agents.model.networks.by_convolution", lambda *_: False),
     ):
         yield
 

@@ -6,7 +6,7 @@ from unittest.mock import patch
 
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from wpt_agents.networks import UpConv
+from wpt_agents.model.networks import UpConv
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
 from wpt_agents.zoo.bench.timing import gflop, plain
 
@@ -43,7 +43,7 @@ def _calls(length: int) -> dict[str, int]:
     rssm._scan = rssm._filter  # type: ignore[method-assign]
     with (
         patch.object(UpConv, "forward", plain),
-        patch("wpt_agents.networks.by_convolution", lambda *_: False),
+        patch("wpt_agents.model.networks.by_convolution", lambda *_: False),
     ):
         return {
             "world model": launches(world_model_step(model, data)),

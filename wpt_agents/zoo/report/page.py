@@ -9,8 +9,8 @@ from typing import Any
 import jinja2
 import yaml
 
-from wpt_agents.archive import replacing
-from wpt_agents.names import counted, unknown_name
+from wpt_agents.files.archive import replacing
+from wpt_agents.files.names import counted, unknown_name
 from wpt_agents.zoo.report import aggregates, sections, tables
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
 from wpt_agents.zoo.report.sections import Names

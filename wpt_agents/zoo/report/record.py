@@ -17,8 +17,8 @@ from typing import Any, Self
 import matplotlib
 import numpy as np
 
-from wpt_agents.archive import replacing
-from wpt_agents.zoo.plan import METHODS
+from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.plan.plan import METHODS
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.tables import interval_text, markdown_table, number

@@ -11,7 +11,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from wpt_agents.names import counted
+from wpt_agents.files.names import counted
 from wpt_agents.zoo.report.aggregates import estimate, references, score_of
 from wpt_agents.zoo.statistics import mean, mean_interval
 

@@ -1,0 +1,676 @@
+"""Algorithm 1 from end to end, and each of its stages on its own."""
+
+from collections import defaultdict
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from debug_agent import (
+    SETTINGS,
+    ClockEnv,
+    agent,
+    noise,
+    on_time,
+    pretrained,
+    recorded,
+    same,
+    weights,
+)
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_env import LENGTH, DotEnv
+
+from wpt_agents.agents import wpt
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.retrieval import Retriever
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.policy import prior_action, stack_frames
+from wpt_agents.training import pretraining
+from wpt_agents.training.guidance import parse_schedule
+from wpt_agents.training.rollout import Rollout
+from wpt_agents.training.updates import PRETRAIN
+
+
+@pytest.fixture
+def store(tmp_path):
+    """Four dots of two actions, and two of four."""
+    with TrajectoryDataset.create(tmp_path / "data") as dataset:
+        dataset.extend(recorded(seed=i, embodiment="dot") for i in range(4))
+        dataset.extend(recorded(seed=i, actions=4, embodiment="wide") for i in range(2))
+    return dataset
+
+
+# ------------------------------------------------------------------------------- end to end
+
+
+def test_algorithm_1_from_reward_free_data_to_actions(store):
+    model = WPT.pretrain(store.path, env=DotEnv(), steps=2, **SETTINGS)
+    before = weights(model, "actor", "critic", "world_model", "prior_actor")
+    assert model.learn(3 * LENGTH) is model
+    after = weights(model, "actor", "critic", "world_model", "prior_actor")
+    assert model.num_timesteps == len(model.replay_buffer) == 3 * LENGTH
+    assert len(model.retrieved.trajectories) == 3 and model.prior is not None
+    moved = {k.split(".")[0] for k in before if (before[k] != after[k]).any()}
+    assert moved == {"actor", "critic", "world_model", "prior_actor"}
+    action, _ = model.predict(noise(2), deterministic=True)
+    assert action.shape == (2, 2)
+
+
+def test_every_switch_off_is_learning_from_scratch(store):
+    model = agent(DotEnv(), offline_ratio=0, guidance=0, dataset=store).learn(2 * LENGTH)
+    assert model.retrieved is None and model.prior is None and model.updates > 0
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not(store):
+    one, same_seed, other = (
+        pretrained(store, env=DotEnv(), seed=seed).learn(2 * LENGTH) for seed in (0, 0, 1)
+    )
+    assert same(weights(one), weights(same_seed))
+    assert not same(weights(one), weights(other))
+
+
+def test_a_reseeded_model_draws_anew():
+    one, other = agent(DotEnv()), agent(DotEnv(), seed=3)
+    other.set_random_seed(0)
+    other.policy.load_state_dict(one.policy.state_dict())
+    assert same(weights(one.learn(2 * LENGTH)), weights(other.learn(2 * LENGTH)))
+
+
+# ------------------------------------------------------------------------------ pre-training
+
+
+def test_pretraining_teaches_the_world_model_and_nothing_else(store):
+    start, end = agent(), pretrained(store)
+    moved = {k for k, v in weights(start).items() if (v != weights(end)[k]).any()}
+    assert moved and all(k.startswith("world_model") for k in moved)
+    assert not any("reward_head" in k for k in moved)
+    assert end.num_timesteps == end.updates == 0
+
+
+def test_pretraining_calls_back_after_every_update_with_finite_metrics(store):
+    seen = []
+    pretrained(store, steps=3, callback=lambda step, metrics: seen.append((step, metrics)))
+    assert [step for step, _ in seen] == [1, 2, 3]
+    assert all("train/kl" in m and np.isfinite(list(m.values())).all() for _, m in seen)
+
+
+def test_pretraining_prepares_batches_ahead_and_draws_them_by_seed_and_step(store, monkeypatch):
+    seen, update = [], WPT._update_world_model
+
+    def watch(self, batch, *rest):
+        seen.append(batch)
+        update(self, batch, *rest)
+
+    monkeypatch.setattr(WPT, "_update_world_model", watch)
+    model = pretrained(store, steps=3)
+    shape = model.batch_size, model.batch_length, model.max_action_dim
+    for step, batch in enumerate(seen):
+        drawn = store.sample(*shape, rng=np.random.default_rng([model.stream_seed, PRETRAIN, step]))
+        assert batch.image.equal(drawn.image) and batch.action.equal(drawn.action)
+    assert len(seen) == 3
+
+
+def test_pretraining_shows_the_time_left(store, capfd):
+    pretrained(store, progress_bar=True)
+    assert "2/2" in capfd.readouterr().err
+
+
+def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
+    pretrained(store, steps=2, run_dir=tmp_path)
+    parts, whole = pretrained(store, steps=5, run_dir=tmp_path), pretrained(store, steps=5)
+    assert same(weights(parts), weights(whole))
+    # the optimiser's averages too: another step keeps them equal
+    batch = store.sample(2, 4, 4, np.random.default_rng(0))
+    for model in (parts, whole):
+        model._update_world_model(batch, defaultdict(list), torch.Generator().manual_seed(0))
+    assert same(weights(parts), weights(whole))
+
+
+def test_killed_pretraining_goes_on_from_its_last_checkpoint(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(pretraining, "EVERY", 2)
+
+    def stop(step, _):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pretrained(store, steps=4, run_dir=tmp_path, callback=stop)
+    steps = []
+    resumed = pretrained(store, steps=4, run_dir=tmp_path, callback=lambda k, _: steps.append(k))
+    assert steps == [3, 4]
+    assert same(weights(resumed), weights(pretrained(store, steps=4)))
+
+
+def test_finished_pretraining_is_only_loaded(store, tmp_path):
+    first, calls = pretrained(store, run_dir=tmp_path), []
+    again = pretrained(store, run_dir=tmp_path, callback=lambda *_: calls.append(1))
+    assert not calls and same(weights(first), weights(again))
+
+
+def test_pretraining_refuses_the_run_folder_of_other_settings(store, tmp_path):
+    pretrained(store, run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"batch_size=2, now it is 3.*run_dir"):
+        pretrained(store, run_dir=tmp_path, batch_size=3)
+
+
+def test_pretraining_takes_trajectories_from_any_iterable():
+    model = pretrained(recorded(seed=i) for i in range(3))
+    assert len(model.dataset) == 3
+
+
+# --------------------------------------------------------------------------------- retrieval
+
+
+def test_retrieval_keeps_to_the_width_takes_each_once_and_hides_rewards(store):
+    with store:
+        store.append(recorded(seed=9, reward=np.ones(8)))
+    model = pretrained(store, env=DotEnv(), num_retrieve=500).learn(1)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3, 6]
+    assert all(t.reward is None for t in model.retrieved.trajectories)
+
+
+def test_retrieval_keeps_to_the_embodiment_when_the_data_names_it(store):
+    with store:
+        store.append(recorded(seed=9, embodiment="other"))
+    model = pretrained(store, env=DotEnv(), num_retrieve=500, embodiment="other").learn(1)
+    assert model.retrieved_ids == [6]
+
+
+def test_a_robot_that_the_data_do_not_name_is_told_and_gets_any_of_its_width(store):
+    model = pretrained(store, env=DotEnv(), num_retrieve=9, embodiment="crab")
+    with pytest.warns(UserWarning, match=r"bears the name 'crab' \(dot, wide\).*of 2 actions"):
+        model.learn(1)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3]
+
+
+def test_retrieval_finds_the_episode_that_begins_where_the_task_does(store):
+    model = pretrained(store, num_retrieve=1)
+    model.set_env(DotEnv())
+    model.env.seed(2)
+    assert model.learn(1).retrieved_ids == [2]
+
+
+def test_the_query_is_an_episodes_first_image_also_in_the_middle_of_one(store):
+    model = pretrained(store, num_retrieve=1, env=DotEnv(), offline_ratio=0, guidance=0)
+    model.env.seed(2)
+    model.learn(LENGTH // 2)  # retrieves nothing
+    model.offline_ratio = 0.5
+    assert model.learn(1, reset_num_timesteps=False).retrieved_ids == [2]
+
+
+def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
+    def found(start, seed):
+        model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
+        model.set_env(DotEnv())
+        model.env.seed(start)
+        return tuple(model.learn(1).retrieved_ids)
+
+    assert found(1, seed=0) == found(2, seed=0)
+    assert len({found(1, seed) for seed in range(6)}) > 1
+    assert all(i < 4 for seed in range(6) for i in found(1, seed))
+
+
+def test_retrieval_without_data_of_the_width_says_what_to_do(store):
+    model = pretrained(store, env=DotEnv(actions=3))
+    with pytest.raises(ValueError, match=r"no trajectory of 3 actions.*offline_ratio=0"):
+        model.learn(1)
+
+
+def test_the_index_is_kept_beside_the_dataset_and_used_again(store, monkeypatch):
+    pretrained(store).build_index()
+    monkeypatch.setattr(Retriever, "build", None)
+    assert len(pretrained(store).build_index()) == 6
+
+
+def test_the_index_is_built_again_when_the_dataset_has_grown(store):
+    pretrained(store).build_index()
+    model = pretrained(store)
+    with store:
+        store.append(recorded(seed=9))
+    model.set_dataset(store.path)
+    assert len(model.build_index()) == 7
+
+
+def test_an_index_of_another_encoder_is_refused(store):
+    model = pretrained(store)
+    model.build_index()
+    [path] = store.path.glob("*.index")
+    Retriever(np.zeros((6, 4), np.float32), np.ones(6), [None] * 6, "another").save(path)
+    with pytest.raises(ValueError, match=r"another.*delete the file"):
+        model.build_index()
+
+
+def test_a_subset_has_an_index_of_its_own(store):
+    model = pretrained(store)
+    model.build_index()
+    for ids in ([0, 1], [2, 3], [5, 4, 3, 2, 1, 0], [0, 0, 1, 2, 3, 4]):
+        model.set_dataset(store.subset(ids))
+        first = next(store.subset(ids).first_observations())
+        np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
+    model.set_dataset(store)
+    whole = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(whole))
+
+
+def test_an_index_of_other_trajectories_is_built_anew(store):
+    model = pretrained(store)
+    model.build_index()
+    size = (store.path / "shard-00000.bin").stat().st_size
+    content = bytearray((store.path / "shard-00000.bin").read_bytes())
+    content[size - 10] ^= 1
+    (store.path / "shard-00000.bin").write_bytes(content)
+    store.validate(set_aside=True)
+    with store:
+        store.append(recorded(seed=9))  # as many as before
+    assert len(store) == 6
+    first = np.concatenate(list(store.first_observations()))
+    np.testing.assert_array_equal(model.build_index().features, model.policy.embed(first))
+
+
+def test_an_index_that_cannot_be_written_is_kept_in_memory(store, monkeypatch):
+    def read_only(*_):
+        raise PermissionError("read-only file system")
+
+    monkeypatch.setattr(Retriever, "save", read_only)
+    with pytest.warns(UserWarning, match="read-only"):
+        assert len(pretrained(store).build_index()) == 6
+
+
+# ------------------------------------------------------------------------ collection, guidance
+
+
+def by_the_prior(model, trajectory):
+    """What the prior actor does at each image of an episode, in the environment's bounds."""
+    state, actions = None, []
+    for t, image in enumerate(trajectory.image[:-1]):
+        action, state = model.prior.predict(image[None], state, np.array([t == 0]))
+        actions.append(action[0])
+    return np.stack(actions)
+
+
+def test_the_prior_actor_drives_the_warm_up_from_end_to_end(store):
+    model = pretrained(store, env=DotEnv(), warmup_steps=LENGTH, train_ratio=0).learn(LENGTH)
+    [episode] = model.replay_buffer.trajectories
+    np.testing.assert_allclose(episode.action, by_the_prior(model, episode), atol=1e-6)
+
+
+def test_the_prior_actor_drives_in_its_window_and_nowhere_else(store, monkeypatch):
+    monkeypatch.setattr(wpt, "draw_window", lambda probability, length, rng: (3, 7))
+    model = pretrained(store, env=DotEnv(), warmup_steps=0, train_ratio=0).learn(LENGTH)
+    [episode] = model.replay_buffer.trajectories
+    guided = np.isclose(episode.action, by_the_prior(model, episode), atol=1e-6).all(1)
+    assert np.flatnonzero(guided).tolist() == [3, 4, 5, 6]
+
+
+def test_guidance_is_drawn_by_the_schedule_once_an_episode(store, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(wpt, "draw_window", lambda p, length, rng: (drawn.append(p), (0, 0))[1])
+    model = pretrained(store, env=DotEnv(), warmup_steps=0, guidance="linear(1,0,50)")
+    model.learn(3 * LENGTH)
+    assert drawn == [1.0, 0.5, 0.0]
+
+
+def test_the_latent_is_filtered_with_the_action_that_was_executed(monkeypatch):
+    policy, seen = agent(DotEnv()).policy, []
+    act = policy.act
+
+    def spy(image, state, first, *args, **kwargs):
+        seen.append((state, first.copy()))
+        return act(image, state, first, *args, **kwargs)
+
+    monkeypatch.setattr(policy, "act", spy)
+    rollout = Rollout(policy, 1, lambda: (1, 3))
+    mine = np.array([[0.5, -0.25, 0, 0]], np.float32)
+    for _ in range(4):
+        rollout.act(noise(1), lambda frames: mine[: len(frames)])
+        rollout.end_step(np.zeros(1), np.zeros(1, bool), {})
+    fed = [state[2] for state, _ in seen]
+    assert not fed[0].any() and not (fed[1] == mine)[:, :2].any()
+    np.testing.assert_array_equal(fed[2], mine)
+    np.testing.assert_array_equal(fed[3], mine)
+    assert [bool(first[0]) for _, first in seen] == [True, False, False, False]
+
+
+def test_without_a_prior_actor_the_warm_up_is_uniform_and_the_actor_takes_over():
+    model = agent(DotEnv(), warmup_steps=LENGTH, train_ratio=0).learn(2 * LENGTH)
+    warm, own = (t.action for t in model.replay_buffer.trajectories)
+    # the actor of fresh weights is a normal of mean about 0; the uniform's quartiles are at 0.5
+    assert 0.3 < (np.abs(warm) > 0.5).mean() < 0.7
+    assert not (warm == own).any()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("terminates", [True, False])
+def test_episodes_are_stored_as_they_were(n_envs, terminates):
+    model = agent(DummyVecEnv([lambda: ClockEnv(terminates=terminates)] * n_envs), embodiment="x")
+    model.learn(2 * 7 * n_envs)
+    assert len(model.replay_buffer.trajectories) == 2 * n_envs
+    for trajectory in model.replay_buffer.trajectories:
+        assert on_time(trajectory) and trajectory.action_dim == 2
+        assert trajectory.terminated == terminates and trajectory.embodiment == "x"
+
+
+def test_num_timesteps_counts_every_call_of_step():
+    model = agent(DummyVecEnv([ClockEnv] * 3))
+    assert model.learn(10).num_timesteps == 12  # a lower bound
+    assert model.learn(7, reset_num_timesteps=False).num_timesteps == 21
+    assert model.learn(5).num_timesteps == 6
+
+
+def test_updates_follow_the_train_ratio():
+    model = agent(ClockEnv(), learning_starts=14, train_ratio=4).learn(42)
+    # 42 - 14 steps, each replayed 4 times, 2 x 4 in an update
+    assert model.updates == 28 * 4 // 8
+
+
+def test_learning_in_two_calls_equals_one():
+    whole, parts = agent(DotEnv()).learn(4 * LENGTH), agent(DotEnv()).learn(2 * LENGTH)
+    parts.learn(2 * LENGTH, reset_num_timesteps=False)
+    assert same(weights(whole), weights(parts))
+
+
+def test_an_episode_goes_on_where_the_last_learn_left_it():
+    model = agent(ClockEnv()).learn(10)
+    model.learn(11, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+class StopAt(BaseCallback):
+    def __init__(self, step, error=None):
+        super().__init__()
+        self.step, self.error, self.ended = step, error, False
+
+    def _on_step(self):
+        if self.num_timesteps == self.step and self.error is not None:
+            raise self.error
+        return self.num_timesteps != self.step
+
+    def _on_training_end(self):
+        self.ended = True
+
+
+def test_an_episode_goes_on_where_a_callback_stopped_it():
+    model, stop = agent(ClockEnv()), StopAt(10)
+    assert model.learn(100, callback=stop).num_timesteps == 10 and stop.ended
+    model.learn(11, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_an_interrupted_step_costs_the_open_episode_and_no_more():
+    model, stop = agent(ClockEnv()), StopAt(10, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, callback=stop)
+    assert stop.ended
+    model.learn(14, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_an_interrupted_update_costs_none_of_those_that_were_earned(monkeypatch):
+    def learn(model):
+        model.learn(4 * LENGTH, reset_num_timesteps=False)
+        return model
+
+    undisturbed, model = learn(agent(DotEnv(), train_ratio=4)), agent(DotEnv(), train_ratio=4)
+    update = model.update
+
+    def interrupted(metrics):
+        if model.updates == 5:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        update(metrics)
+
+    monkeypatch.setattr(model, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        learn(model)
+    model.learn(3 * LENGTH, reset_num_timesteps=False)
+    assert model.num_timesteps == 4 * LENGTH
+    assert (model.updates, model.credit) == (undisturbed.updates, undisturbed.credit)
+
+
+def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch):
+    undisturbed = pretrained(store, env=DotEnv(), bc_steps=3).learn(1)
+    model = pretrained(store, env=DotEnv(), bc_steps=3)
+    descend, steps = model._descend, []
+
+    def interrupted(*given):
+        steps.append(descend(*given))
+        if len(steps) == 2:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(model, "_descend", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(1)
+    assert not model.cloned
+    model.learn(1)
+    assert same(weights(model, "prior_actor"), weights(undisturbed, "prior_actor"))
+
+
+@pytest.mark.parametrize("name", ["learning_rate", "actor_critic_learning_rate"])
+def test_a_learning_rate_of_zero_teaches_nothing(name):
+    model = agent(DotEnv(), **{name: 0})
+    before = weights(model, "world_model", "actor", "critic")
+    after = weights(model.learn(2 * LENGTH), "world_model", "actor", "critic")
+    moved = {k.split(".")[0] for k in before if (before[k] != after[k]).any()}
+    assert moved == {"world_model", "actor", "critic"} - (
+        {"world_model"} if name == "learning_rate" else {"actor", "critic"}
+    )
+
+
+def test_a_given_episode_length_is_kept():
+    model = agent(ClockEnv(), episode_length=5).learn(14)
+    assert model.episode_length == model.hyperparameters["episode_length"] == 5
+
+
+# ------------------------------------------------------------------------------ another task
+
+
+def test_another_width_drops_behaviour_and_replay_and_keeps_the_world_model(store):
+    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
+    kept, dropped = (
+        weights(model, "world_model.rssm", "world_model.encoder"),
+        weights(model, "actor"),
+    )
+    model.set_env(DotEnv(actions=4))
+    assert same(kept, weights(model, "world_model.rssm", "world_model.encoder"))
+    assert not same(dropped, weights(model, "actor"))
+    assert len(model.replay_buffer) == 0 and model.prior is None
+    assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5]
+    assert model.replay_buffer.trajectories[0].action_dim == 4
+
+
+def test_another_width_drops_what_was_retrieved_before_the_first_episode_ended(store):
+    model = pretrained(store, env=DotEnv()).learn(1)
+    assert model.cloned and model.episodes == 0
+    model.set_env(DotEnv(actions=4))
+    assert not model.cloned and sorted(model.learn(1).retrieved_ids) == [4, 5]
+
+
+def test_another_task_begins_with_an_episode_of_its_own():
+    model = agent(ClockEnv()).learn(4)
+    model.reset_task()
+    model.learn(3, reset_num_timesteps=False)
+    assert not model.replay_buffer.trajectories  # 4 + 3 steps would have ended the old one
+
+
+def test_one_pretrained_model_loads_onto_every_width(store, tmp_path):
+    pretrained(store).save(tmp_path / "model")
+    for actions in (1, 2, 4):
+        model = WPT.load(tmp_path / "model", env=ClockEnv(actions=actions)).learn(14)
+        assert model.predict(noise(), deterministic=True)[0].shape == (actions,)
+
+
+def test_open_loop_shows_the_context_and_then_a_dream(store):
+    trajectory = recorded(length=12)
+    model = pretrained(store)
+    frames = model.open_loop(trajectory, context=4, horizon=6)
+    assert frames.shape == (10, 64, 64, 3) and frames.dtype == np.uint8
+    assert (frames == model.open_loop(trajectory, context=4, horizon=6)).all()
+    short = model.open_loop(Trajectory(trajectory.image[:8], trajectory.action[:7]))
+    assert len(short) == 8
+
+
+def test_the_forward_passes_can_run_in_bfloat16(store):
+    model = pretrained(store, env=DotEnv(), precision="bf16").learn(2 * LENGTH)
+    assert all(torch.isfinite(v).all() for v in weights(model).values())
+
+
+def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_reward(monkeypatch):
+    model, episode = agent(ClockEnv()), recorded(length=6)
+    episode = replace(episode, reward=np.arange(6, dtype=np.float32))
+    world_model = model.policy.world_model
+    grey, three = torch.zeros(7, 32, 32, 12), torch.full((1, 7), 3.0)  # 0: between black and white
+    monkeypatch.setattr(world_model.decoder, "parities", lambda code: grey)
+    monkeypatch.setattr(world_model, "reward", lambda feat: three)
+    errors = model.policy.heldout_errors(episode)
+    by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()
+    assert errors["reconstruction"] == pytest.approx(by_hand, rel=1e-4)
+    assert errors["reward"] == pytest.approx(np.mean([3, 2, 1, 0, 1, 2]))
+    assert len(errors) == 2
+
+
+def test_every_episode_is_judged_before_it_is_replayed(monkeypatch):
+    model, seen = agent(ClockEnv()), []
+    judge = model.policy.heldout_errors
+    monkeypatch.setattr(
+        model.policy,
+        "heldout_errors",
+        lambda t: seen.append(len(model.replay_buffer.trajectories)) or judge(t),
+    )
+    model.learn(21)
+    assert seen == [0, 1, 2]
+
+
+def test_datasets_of_equal_shapes_are_told_apart_whatever_their_codec(tmp_path):
+    for codec in ("raw", "zstd"):
+        prints = set()
+        for i, seeds in enumerate([(0, 1), (0, 1), (0, 2)]):
+            folder = tmp_path / f"{codec}{i}"
+            with TrajectoryDataset.create(folder, codec=codec) as dataset:
+                dataset.extend(recorded(seed=seed) for seed in seeds)
+            prints.add(dataset.fingerprint)
+        assert len(prints) == 2
+
+
+def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path):
+    model = pretrained(store, env=DotEnv()).learn(LENGTH)
+    model.save(tmp_path / "model")
+    with TrajectoryDataset.create(tmp_path / "other") as other:
+        other.extend(recorded(seed=i, actions=4) for i in range(4))
+        other.extend(recorded(seed=i) for i in range(3))
+    loaded = WPT.load(tmp_path / "model", env=DotEnv(), dataset=other)
+    assert sorted(loaded.learn(LENGTH).retrieved_ids) == [4, 5, 6]
+    model.set_dataset(other)
+    assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5, 6]
+    assert {t.action_dim for t in model.retrieved.trajectories} == {2}
+
+
+def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_path):
+    env = Monitor(ClockEnv(length=7))  # no spec: nothing says how long it lasts
+    model = pretrained(store, env=env, guidance=1, warmup_steps=0)
+    assert model._episode_length() == 500  # a guess, until an episode has been seen
+    model.learn(7)
+    assert model._episode_length() == 7
+    model.save(tmp_path / "model")
+    assert WPT.load(tmp_path / "model", env=ClockEnv(length=7))._episode_length() == 7
+    model.reset_task()
+    assert model._episode_length() == 500
+
+
+def test_another_task_starts_from_returns_of_no_known_scale():
+    model = agent(DotEnv())
+    model.policy.return_scale.fill_(1000)
+    model.reset_task()
+    assert model.policy.return_scale == 1
+
+
+def test_guidance_that_begins_later_has_a_clone_too(store):
+    model = pretrained(store, env=DotEnv(), guidance="linear(0,1,40)").learn(2 * LENGTH)
+    assert model.cloned
+
+
+def replayed(model):
+    """A batch of the model's replay and the latents of its images."""
+    batch = model.replay_buffer.sample(2, 5, 4, np.random.default_rng(0))
+    with torch.no_grad():
+        post, *_ = model.policy.world_model.observe(batch, torch.Generator().manual_seed(0))
+    return post, batch
+
+
+def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule(store):
+    model = pretrained(store, env=DotEnv(), kickstart="linear(20,0,100)").learn(2 * LENGTH)
+    post, batch = replayed(model)
+    policy, by_hand = model.policy, []
+    for b in range(2):
+        frames = None
+        for t in range(5):
+            frames = stack_frames(batch.image[b, t : t + 1].numpy(), frames, None)
+            own = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
+            error = (own - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
+            by_hand += [error.mean().item()] * (t >= 2)
+    metrics = defaultdict(list)
+    loss = model._imitation(post, batch, metrics)
+    assert model.num_timesteps == 50  # half way from 20 to 0
+    assert loss.item() == pytest.approx(10 * metrics["train/kickstart_loss"][0].item())
+    assert loss.item() == pytest.approx(10 * np.mean(by_hand), rel=1e-4)
+
+
+def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
+    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
+    policy, before = model.policy, deepcopy(model.policy.state_dict())
+    taught = []
+    for weight in (0, 5):
+        policy.load_state_dict(before)
+        model._setup_optimizers()
+        model.kickstart_schedule = parse_schedule(weight, np.inf)
+        model.updates = 0
+        model.update(defaultdict(list))
+        taught.append(weights(model))
+    moved = {k.split(".")[0] for k in before if (taught[0][k] != taught[1][k]).any()}
+    assert moved == {"actor"}
+    assert WPT("WPTPolicy", size="debug").kickstart_schedule(0) == 0
+
+
+def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
+    distances = []
+    for kickstart in (0.0, 100.0):
+        model = pretrained(
+            *(store, 2),
+            **{"env": DotEnv(), "kickstart": kickstart, "guidance": 1, "train_ratio": 8},
+            **{"actor_critic_learning_rate": 3e-3, "bc_steps": 30, "return_norm": True},
+        ).learn(4 * LENGTH)
+        model.kickstart_schedule = parse_schedule(1)
+        distances.append(model._imitation(*replayed(model), defaultdict(list)).item())
+    assert distances[1] < 0.2 * distances[0]
+
+
+def test_kickstarting_alone_has_a_clone_and_wants_windows_of_three_images(store):
+    assert pretrained(store, env=DotEnv(), guidance=0, kickstart=1).learn(LENGTH).cloned
+    with pytest.raises(ValueError, match=r"kickstart .*3 images.*batch_length=2"):
+        agent(DotEnv(), kickstart=1, batch_length=2)
+
+
+@pytest.mark.filterwarnings("ignore:No dataset")
+def test_kickstarting_without_a_clone_does_not_imitate_an_untrained_one():
+    model = agent(DotEnv(), kickstart=1).learn(2 * LENGTH)
+    assert not model.cloned and model._imitation(*replayed(model), defaultdict(list)) == 0
+
+
+def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):
+    with pytest.warns(UserWarning, match=r"No dataset: .*model.prior .*dataset=.*guidance=0"):
+        assert agent(DotEnv()).learn(LENGTH).prior is None
+    recwarn.clear()
+    agent(DotEnv(), offline_ratio=0, guidance=0).learn(LENGTH)
+    agent(DotEnv(), dataset=store).learn(LENGTH)
+    assert not [warning for warning in recwarn if "No dataset" in str(warning.message)]
+
+
+def test_a_seed_that_was_set_is_saved(tmp_path):
+    model = agent(DotEnv())
+    model.set_random_seed(5)
+    model.save(tmp_path / "model")
+    assert WPT.load(tmp_path / "model").seed == 5

@@ -1,0 +1,139 @@
+"""The quick step of acting is the defined one, whatever becomes of the weights."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from debug_agent import agent, noise
+from torch.utils._python_dispatch import TorchDispatchMode
+from toy_env import LENGTH, DotEnv
+
+from wpt_agents.fast import acting
+from wpt_agents.fast.acting import PATCHES, FastStep
+
+NAMES = ("deter", "stoch", "action")
+
+
+def acted(policy, n, deterministic=False, steps=3):
+    """State and action after some steps, one environment starting anew at the last of them."""
+    state, generator = None, torch.Generator().manual_seed(0)
+    for t in range(steps):
+        first = np.arange(n) == (n - 1 if t == steps - 1 else -1)
+        image = noise(n, seed=t)
+        _, state = policy.act(image, state, first, deterministic, generator)
+    return dict(zip(NAMES, state, strict=True))
+
+
+def by_definition(policy, *args, **kwargs):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(policy, "_stepper", lambda: policy.step)
+        return acted(policy, *args, **kwargs)
+
+
+def assert_defined(policy, n=1, **kwargs):
+    fast, expected = acted(policy, n, **kwargs), by_definition(policy, n, **kwargs)
+    assert isinstance(policy._stepper(), FastStep)
+    for name in NAMES:
+        np.testing.assert_allclose(fast[name], expected[name], atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("size", ["debug", "tiny"])
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("n", [1, 2, PATCHES // 36 + 1])  # 14 x 14 patches make 6 x 6
+def test_the_quick_step_is_the_defined_one(size, deterministic, n):
+    assert_defined(agent(size=size).policy, n, deterministic=deterministic)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_wide_z_picks_rows(n, monkeypatch):
+    monkeypatch.setattr(acting, "WIDE_STOCH", 64)
+    policy = agent(size="tiny").policy
+    assert policy._stepper().outputs.from_stoch.rows is not None
+    assert_defined(policy, n)
+
+
+def test_the_quick_step_calls_fewer_operators():
+    class Count(TorchDispatchMode):
+        calls = 0
+
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            self.calls += 1
+            return func(*args, **kwargs or {})
+
+    policy, counts = agent().policy, []
+    for play in (acted, by_definition):
+        play(policy, 1)
+        with torch.no_grad(), Count() as count:
+            play(policy, 1)
+        counts.append(count.calls)
+    assert counts[0] < 0.8 * counts[1], counts
+
+
+def test_every_changed_weight_is_noticed():
+    policy = agent().policy
+    acted(policy, 1)
+    for network in (policy.world_model.encoder, policy.world_model.rssm, policy.actor):
+        for weight in network.parameters():
+            with torch.no_grad():
+                weight.add_(0.1 * torch.randn(weight.shape, generator=torch.Generator()))
+    assert_defined(policy)
+    for weight in (policy.world_model.rssm.post_in.weight, policy.actor.layers[0][0].bias):
+        before = acted(policy, 1)["action"]
+        with torch.no_grad():
+            weight.mul_(-3)
+        assert (acted(policy, 1)["action"] != before).any()
+        assert_defined(policy)
+
+
+def test_updates_and_loaded_and_replaced_weights_are_noticed():
+    model, other = agent(DotEnv()), agent(seed=5).policy
+    policy = model.policy
+    model.learn(2 * LENGTH)
+    assert model.updates > 0
+    assert_defined(policy)
+    policy.load_state_dict(other.state_dict())
+    assert_defined(policy)
+    policy.load_state_dict(agent(seed=6).policy.state_dict(), assign=True)
+    assert_defined(policy)
+    policy.reset_behavior()
+    assert_defined(policy)
+    for seed in range(3):  # in new memory, maybe that of the vector before
+        vector = policy.parameters_to_vector()
+        policy.load_from_vector(vector + np.random.default_rng(seed).normal(0, 0.1, vector.shape))
+        assert_defined(policy)
+
+
+def test_images_may_lie_in_memory_as_they_like():
+    policy, image = agent().policy, noise(2)
+    turned = np.ascontiguousarray(image.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
+    action, other = (
+        policy.act(each, None, None, deterministic=True)[0] for each in (image, turned)
+    )
+    np.testing.assert_array_equal(action, other)
+
+
+def test_foreign_networks_act_by_the_definition():
+    policy = agent().policy
+    expected = acted(policy, 2)
+    policy.actor = torch.compile(policy.actor, backend="eager")
+    assert policy._stepper() == policy.step
+    for name, value in acted(policy, 2).items():
+        np.testing.assert_allclose(value, expected[name], atol=1e-5)
+
+
+def test_weights_that_count_no_changes_act_by_the_definition():
+    with torch.inference_mode():
+        policy = agent().policy
+        assert policy._stepper() == policy.step
+        acted(policy, 1)
+
+
+def test_a_policy_that_has_acted_is_copied_with_its_weights():
+    policy = agent().policy
+    acted(policy, 1)
+    twin = copy.deepcopy(policy)
+    with torch.no_grad():
+        twin.actor.layers[-1].bias.add_(1)
+    assert_defined(twin)
+    assert_defined(policy)

@@ -1,0 +1,134 @@
+"""Print hashes of what every agent learns and does, to show that a refactoring changes no number.
+
+Run it before and after a change, on the same machine::
+
+    python tests/helpers/sameness.py > before.txt
+    python tests/helpers/sameness.py > after.txt
+    diff before.txt after.txt
+
+Each line names an agent and holds a hash of its losses and weights after 20 updates, or of its
+actions over 200 steps. `--values` prints every loss beside the hash, to see by how much it differs.
+"""
+
+import argparse
+import hashlib
+import sys
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+from debug_agent import SETTINGS, ClockEnv, agent, pretrained, recorded
+from toy_env import DotEnv
+
+from wpt_agents import WPT, TrajectoryDataset
+
+UPDATES, STEPS = 20, 200
+DATA = [recorded(seed=seed, length=12) for seed in range(6)]
+
+
+def digest(tensors: Mapping[str, torch.Tensor]) -> str:
+    """Return a short hash of names, shapes and bytes."""
+    sha = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        array = tensor.detach().cpu().contiguous().numpy()
+        sha.update(f"{name}{array.shape}{array.dtype}".encode())
+        sha.update(array.tobytes())
+    return sha.hexdigest()[:16]
+
+
+def weights(model: WPT) -> dict[str, torch.Tensor]:
+    """Return all weights of a model."""
+    return dict(model.policy.state_dict())
+
+
+def updated(model: WPT) -> dict[str, torch.Tensor]:
+    """Make 20 updates; return the losses of each."""
+    metrics: dict[str, list[torch.Tensor]] = defaultdict(list)
+    for _ in range(UPDATES):
+        model.update(metrics)
+    return {name: torch.stack(values) for name, values in metrics.items()}
+
+
+def learnt(method: Mapping[str, object]) -> tuple[WPT, dict[str, torch.Tensor]]:
+    """Pre-train if the method has data, learn for a few episodes, then make 20 updates."""
+    if "dataset" in method:
+        model = pretrained(**method)
+    else:
+        model = agent(**method)
+    model.set_env(DotEnv())
+    model.learn(60)
+    return model, updated(model)
+
+
+def pretraining() -> tuple[WPT, dict[str, torch.Tensor]]:
+    """Pre-train for 20 updates; return the losses of each."""
+    metrics: dict[str, list[torch.Tensor]] = defaultdict(list)
+
+    def note(step: int, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            metrics[name].append(torch.tensor(value, dtype=torch.float64))
+
+    model = WPT.pretrain(DATA, steps=UPDATES, callback=note, **SETTINGS)
+    return model, {name: torch.stack(values) for name, values in metrics.items()}
+
+
+def explored(name: str) -> tuple[WPT, dict[str, torch.Tensor]]:
+    """Explore for two episodes, then make 20 updates."""
+    try:
+        from wpt_agents.agents.curious import EXPLORERS
+    except ModuleNotFoundError:  # before the agents had a folder of their own
+        from wpt_agents.agents.curious import EXPLORERS
+    settings = SETTINGS | {"offline_ratio": 0.0, "guidance": 0.0}
+    model = EXPLORERS[name]("WPTPolicy", ClockEnv(), **settings)
+    list(model.explore(3))
+    return model, updated(model)
+
+
+def acted(model: WPT) -> dict[str, torch.Tensor]:
+    """Act for 200 steps in two environments at once, deterministically and sampled."""
+    rng, actions = np.random.default_rng(5), []
+    for deterministic in (True, False):
+        state, start = None, np.ones(2, bool)
+        torch.manual_seed(0)
+        for step in range(STEPS // 2):
+            image = rng.integers(0, 256, (2, 64, 64, 3)).astype(np.uint8)
+            action, state = model.predict(image, state, start, deterministic)
+            start = np.array([step % 9 == 8, False])
+            actions.append(torch.from_numpy(np.array(action)))
+    return {"action": torch.stack(actions)}
+
+
+def main() -> None:
+    """Print one line for each agent."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--values", action="store_true", help="print every loss, too")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    warnings.simplefilter("ignore")
+    data = TrajectoryDataset.of(DATA)
+    cases: dict[str, Callable[[], tuple[WPT, dict[str, torch.Tensor]]]] = {
+        "pre-training": pretraining,
+        "wpt": lambda: learnt({"dataset": data, "guidance": 1.0}),
+        "kickstart": lambda: learnt({"dataset": data, "kickstart": "linear(20,2,100)"}),
+        "scratch": lambda: learnt({"offline_ratio": 0.0, "guidance": 0.0}),
+        "icm": lambda: explored("icm"),
+        "plan2explore": lambda: explored("plan2explore"),
+    }
+    for name, case in cases.items():
+        model, losses = case()
+        print(f"{name:14} losses {digest(losses)}  weights {digest(weights(model))}", flush=True)
+        if options.values:
+            for loss, values in sorted(losses.items()):
+                print(f"  {loss}: {values.tolist()}")
+        if name == "wpt":
+            print(f"{'acting':14} actions {digest(acted(model))}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

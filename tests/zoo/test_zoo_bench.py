@@ -1,0 +1,182 @@
+import json
+import sys
+
+import pytest
+import torch
+from rich.console import Console, ConsoleDimensions
+from torch import nn
+from typer.testing import CliRunner
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.model import networks
+from wpt_agents.model.networks import BlockLinear, FromPixel, ToPixels, UpConv
+from wpt_agents.zoo.__main__ import app
+from wpt_agents.zoo.bench import model as bench_model
+from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
+from wpt_agents.zoo.commands.options import print_table
+
+KEYS = {
+    *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
+    *("gflop_per_s", "ceiling_gflop_per_s", "share_of_ceiling", "rss_mb"),
+}
+
+
+def test_the_model_bench_prints_a_json_object_for_each_case():
+    ran = CliRunner().invoke(app, ["bench", "model", "--quick", "--json"])
+    assert ran.exit_code == 0, ran.output
+    rows = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [row["what"] for row in rows] == ["world model", "whole update"]
+    for row in rows:
+        assert set(row) >= KEYS
+        assert row["gflop_per_s"] == pytest.approx(row["gflop"] / row["median_s"])
+        assert torch.cuda.is_available() or row["onednn_gflop_per_s"] > 1
+    alone, whole = rows
+    assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
+
+
+def test_several_threads_take_turns_with_one():
+    seen = []
+    torch.set_num_threads(2)
+    try:
+        step = (lambda: seen.append(torch.get_num_threads())), {}
+        (row,) = bench_model.measured_in_turn([step], repetitions=2, counted=[lambda: None])
+        assert torch.get_num_threads() == row["threads"] == 2 and row["times_one_thread"] > 0
+    finally:
+        torch.set_num_threads(1)
+    assert seen == [2, *3 * [2, 1]]  # the memory; a warm-up and two repetitions
+    (row,) = bench_model.measured_in_turn([step], repetitions=1, counted=[lambda: None])
+    assert "times_one_thread" not in row
+
+
+def test_a_product_by_convolution_counts_as_the_product(monkeypatch):
+    monkeypatch.setattr(networks, "AMD_AVX512", True)
+    monkeypatch.setattr(networks, "WORK", 0)
+    layer, x = BlockLinear(32, 64, 4), torch.ones(networks.MANY, 32)
+    assert networks.by_convolution(x, 16)
+    work = 2 * 2 * networks.MANY * 32 * 64 / 4  # backward for the weights alone
+    assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(work / 1e9)
+    assert networks.by_convolution(x, 16)  # it is back
+
+
+def test_work_is_counted_as_the_layers_are_defined():
+    fast = UpConv.forward, UpConv.parities, FromPixel.forward
+    # 3 x 5 by 5 x 7 is 2 * 105; backward the same twice, once without a gradient of the input
+    layer, x = nn.Linear(5, 7), torch.ones(3, 5)
+    assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(2 * 2 * 105 / 1e9)
+    up, pixels = UpConv(4, 2, 6), torch.ones(3, 4, 5, 5)  # each of 5 x 5 pixels meets 6 x 6 weights
+    work = 2 * 3 * 25 * 4 * 2 * 36
+    assert timing.gflop(lambda: up(pixels)) == pytest.approx(work / 1e9)
+    one, pixel = FromPixel(4, 2, 5), torch.ones(3, 4, 1, 1)
+    assert timing.gflop(lambda: one(pixel)) == pytest.approx(2 * 3 * 4 * 2 * 25 / 1e9)
+    last = ToPixels(4, 2, 6)
+    assert timing.gflop(lambda: last.parities(pixels)) == pytest.approx(work / 1e9)
+    assert fast == (UpConv.forward, UpConv.parities, FromPixel.forward)  # they are back
+
+
+def test_the_median_leaves_the_warm_up_out():
+    calls = []
+    timing.seconds(lambda: calls.append(0), repetitions=3, warmup=2)
+    assert len(calls) == 5
+
+
+def test_one_thread_counts_processor_time_and_several_wall_clock(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for threads, counted in ((1, "processor"), (2, "wall")):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        assert timing.cost("processor", "wall") == counted
+
+
+def test_the_other_cases_yield_rows():
+    acting = list(policy.rows(quick=True))
+    assert [row["what"] for row in acting] == ["policy step", "policy step, by definition"]
+    assert all(row["batch"] == 1 and row["median_s"] > 0 for row in acting)
+    (sampling,) = replay.rows(quick=True)
+    assert sampling["image_mb"] == pytest.approx(3 * 501 * 64 * 64 * 3 / 2**20)
+    every, *top = profile.rows(quick=True)
+    assert every["count"] > sum(row["count"] for row in top) > 0
+    shares = [row["share"] for row in top]
+    assert shares == sorted(shares, reverse=True) and sum(shares) < 1
+
+
+def test_scaling_tells_the_cost_of_a_unit_and_draws_it(tmp_path):
+    picture = tmp_path / "growth.png"
+    arguments = ["bench", "scaling", "--quick", "--json", "--plot", str(picture)]
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0, ran.output
+    rows = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [row["grows"] for row in rows] == ["environments", *4 * ["batch"]]
+    for row in rows[1:]:
+        assert row["unit"] == "image"
+        images = row["batch"] * row["length"]
+        assert row["ms_per_unit"] == pytest.approx(1000 * row["median_s"] / images)
+    assert rows[0]["unit"] == "action"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_each_axis_of_the_grid_holds_all_else_equal():
+    for axis, cases in scaling.GRID.items():
+        position = ("size", "batch", "length").index(axis)
+        assert len({case[position] for case in cases}) == len(cases) > 2
+        assert len({case[:position] + case[position + 1 :] for case in cases}) == 1
+
+
+def test_the_memory_of_a_row_is_its_own():
+    def held(numbers):
+        timing.forget_peak()
+        before = timing.peak_rss_mb()
+        torch.ones(numbers)
+        return timing.peak_rss_mb() - before
+
+    big, small = held(64 * 2**18), held(2**18)  # 64 and 1 MB of float32
+    assert big > 60
+    if sys.platform == "linux":  # elsewhere the system does not forget
+        assert small < 20
+
+
+def test_every_row_tells_the_memory():
+    ran = CliRunner().invoke(app, ["bench", "profile", "--quick", "--json"])
+    assert all(json.loads(line)["rss_mb"] > 0 for line in ran.stdout.splitlines())
+
+
+def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
+    def missing(name):
+        raise ModuleNotFoundError(f"No module named {name!r}", name="h5py")
+
+    monkeypatch.setattr("wpt_agents.zoo.bench.command.importlib.import_module", missing)
+    ran = CliRunner().invoke(app, ["bench", "data"])
+    assert isinstance(ran.exception, ValueError) and "h5py" in str(ran.exception)
+    ran = CliRunner().invoke(app, ["bench", "--quick"])
+    assert ran.exit_code == 0 and "bench data left out: it needs h5py" in ran.stderr
+
+
+def test_a_table_shortens_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(Console, "size", ConsoleDimensions(60, 25))
+    task = "metaworld-button-press-topdown-wall"
+    print_table("envs", [{"what": "step", "task": task, "a_long_heading_of_a_column": 1}])
+    told = capsys.readouterr().out
+    joined = "".join(c for c in told if c.isalnum() or c in "-_")
+    assert max(map(len, told.splitlines())) <= 60 and "…" not in told
+    assert all(part in joined for part in ("button-press", "wall", "heading"))
+
+
+def test_acting_by_definition_is_measured_by_the_definition():
+    agent = WPT(size="debug", max_action_dim=2, seed=0)
+    quick, seen = agent.policy._stepper(), []
+    policy.defined(agent.policy, lambda: seen.append(agent.policy._stepper()))
+    assert seen == [agent.policy.step] and agent.policy._stepper() is quick
+
+
+def test_calls_are_of_operators_that_compute():
+    x = torch.ones(2, 3, requires_grad=True)
+    assert work.launches(lambda: x.t()[0].unsqueeze(0)) == 0
+    assert work.launches(lambda: (x * 2) + 1) == 2
+    assert work.launches(lambda: (x * 2).sum().backward()) > 3
+
+
+def test_the_work_of_a_batch_is_counted_on_a_part_of_it():
+    rows = list(work.rows(quick=True))
+    assert [row["what"] for row in rows] == ["world model", "whole update"]
+    model = bench_model.agent("debug")
+    step = bench_model.world_model_step(model, bench_model.synthetic_batch(2, 8))
+    assert rows[0]["tflop"] == pytest.approx(timing.gflop(step) * 64 / 1e3, rel=0.02)
+    assert rows[1]["operator_calls"] > rows[0]["operator_calls"] > 100

@@ -1,0 +1,235 @@
+"""The page says what the run folders say, and needs nothing but itself."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from run_folders import make_run
+
+from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.report import aggregates, figures, sections
+from wpt_agents.zoo.report.aggregates import misprint, references
+from wpt_agents.zoo.report.folders import read_results
+from wpt_agents.zoo.report.page import write_page
+from wpt_agents.zoo.report.sections import shared_about
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for seed in (0, 1):
+        make_run(tmp_path, "dmc-walker-run", seed, "wpt", (700.0, 760.0))
+        make_run(tmp_path, "dmc-walker-run", seed, "scratch", (90.0, 110.0))
+        make_run(tmp_path, "metaworld-reach", seed, "wpt", (9.0, 1.0 + 8 * seed))
+    failed = tmp_path / "debug" / "wpt" / "dmc-walker-walk_0"
+    failed.mkdir()
+    (failed / "config.yaml").write_text("task: x")
+    (failed / "error.txt").write_text("Traceback\nRuntimeError: <out> of luck\n")
+    return tmp_path
+
+
+@pytest.fixture
+def page(runs):
+    write_page(runs, runs / "report" / "index.html")
+    return (runs / "report" / "index.html").read_text()
+
+
+class Reader(HTMLParser):
+    """Collects attributes, and checks that elements close in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.links, self.ids = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.handle_startendtag(tag, attributes)
+        if tag not in ("meta", "br", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        given = dict(attributes)
+        self.links += [given[key] for key in ("src", "href", "xlink:href") if key in given]
+        self.ids += [given["id"]] if "id" in given else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def read(page):
+    reader = Reader()
+    reader.feed(page)
+    assert reader.open == []
+    return reader
+
+
+def text(page):
+    return re.sub(r"\s+", " ", re.sub(r"<(style|svg).*?</\1>|<[^>]+>", " ", page, flags=re.S))
+
+
+def test_the_page_needs_no_network_and_no_script(page):
+    outside = {link for link in read(page).links if not link.startswith(("#", "data:"))}
+    assert outside == {"https://arxiv.org/abs/2108.13264"}  # a link to read, nothing that loads
+    assert "<script" not in page and "@import" not in page and "url(http" not in page
+
+
+def test_every_link_within_the_page_leads_somewhere(page):
+    reader = read(page)
+    assert {link[1:] for link in reader.links if link.startswith("#")} <= set(reader.ids)
+    runs = [name for name in reader.ids if name.startswith("run-")]
+    assert len(runs) == len(set(runs)) == 6
+
+
+def test_our_numbers_stand_beside_the_papers(page):
+    row = text(re.search(r"<tr><td>walker-run</td>.*?</tr>", page, re.S)[0])
+    assert "730" in row and "728" in row  # ours, and Table 5's
+    assert "100" in row  # scratch
+    assert "Table 5: DMControl, return" in page and "Table 4" in page
+    assert "wpt ours: 1,000 frames, seeds 0, 1, commit 0123456789ab" in text(page)
+
+
+def test_budgets_seeds_and_commits_stand_in_the_cells_where_they_differ(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", 0)
+    for seed in range(2):
+        make_run(tmp_path, "dmc-cheetah-run", seed)
+    write_page(tmp_path, tmp_path / "index.html")
+    told = text((tmp_path / "index.html").read_text())
+    assert "1,000 frames, seeds 0, commit 0123456789ab" in told
+    assert "1,000 frames, seeds 0, 1, commit 0123456789ab" in told
+
+
+def test_budgets_seeds_and_commits_stand_at_the_columns_head_where_they_agree():
+    def row(*abouts):
+        return {"ours": [{"run": "a", "about": about} for about in abouts]}
+
+    alike = [row("1k frames", "1k frames"), row("1k frames", "2k frames")]
+    assert [shared_about(alike, place) for place in range(2)] == ["1k frames", ""]
+    assert [[cell["about"] for cell in r["ours"]] for r in alike] == [
+        ["", "1k frames"],
+        ["", "2k frames"],
+    ]
+
+
+def test_tasks_that_were_not_run_are_folded_away(page):
+    section = re.search(r'<section id="table-5">.*?</section>', page, re.S)[0]
+    shown, folded = section.split("<details")
+    rows = re.findall(r"<tr[^>]*><td>(.*?)</td>", shown)
+    assert rows == ["walker-run", "mean", "median"]
+    assert "21 more tasks of the paper, not run here" in folded and "acrobot-swingup" in folded
+    assert "ours" not in folded  # no column of dashes
+
+
+def test_one_seed_has_no_interval_and_the_page_says_so(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", 0, "wpt", (700.0, 760.0))
+    make_run(tmp_path, "dmc-walker-run", 0, "scratch", (90.0, 110.0))
+    write_page(tmp_path, tmp_path / "index.html")
+    told = text((tmp_path / "index.html").read_text())
+    assert "0.73 to 0.73" not in told
+    assert "1 of 22 1 0.73 no interval 0.73 no interval" in told
+    assert "scratch 1.00 no interval 1" in told  # probability of improvement
+    assert "730 one seed: no interval" in told
+    assert "One seed a task: no interval over seeds" in told
+    assert "No run of the method" not in told
+
+
+def test_misprints_of_the_paper_are_marked_with_what_the_rows_give(page):
+    mean = text(re.search(r'<tr class="aggregate"><td>mean</td>.*?</tr>', page, re.S)[0])
+    assert "0.90* rows give 0.656" in mean
+
+
+def test_which_printed_aggregates_do_not_follow_from_their_rows():
+    wrong = {(r.task, r.method, r.samples): misprint(r) for r in references() if misprint(r)}
+    assert {key: round(value, 4) for key, value in wrong.items()} == {
+        ("mean", "dreamer-v3", 1_000_000): 0.6559,
+        ("mean", "drq-v2", 150_000): 0.4298,
+        ("mean", "wpt", 150_000): 0.7536,
+        ("median", "wpt", 150_000): 0.835,
+    }
+
+
+def test_aggregates_profiles_curves_ablation_and_improvement_are_there(page):
+    told = text(page)
+    # walker-run: 0.73 in both seeds; the paper's on the same task 0.728
+    assert "wpt debug, 1,000 frames 1 of 22 2 0.73 0.73 to 0.73" in told
+    assert "scratch 1.00 1.00 to 1.00 1" in told  # probability of improvement, tasks in common
+    titles = re.findall(r'aria-label="([^"]*)"', page)
+    assert "DMControl: performance profile" in titles and "metaworld-reach" in titles
+    assert "DMControl: ablation, debug, 1,000 frames" in titles
+    assert "Mean of the two suites" in told
+
+
+def test_every_run_shows_its_command_seed_commit_and_the_first_its_pictures(page):
+    card = re.search(r'id="run-dmc-walker-run-scratch-debug-1000-1".*?</details>', page, re.S)[0]
+    assert "python -m wpt_agents.zoo run --tasks dmc-walker-run" in card
+    assert "seed 1" in card and "0123456789ab" in card
+    assert page.count("<video") == 2  # one a task
+    assert page.count("data:image/jpeg;base64,") == 4  # predictions and what was retrieved
+    assert page.count("what was retrieved") == 2
+
+
+@pytest.mark.parametrize(("media", "videos"), [("all", 6), ("none", 0)])
+def test_how_many_videos_the_page_holds_is_ones_choice(runs, media, videos):
+    write_page(runs, runs / "index.html", media)
+    assert (runs / "index.html").read_text().count("<video") == videos
+
+
+def test_what_failed_is_told_and_escaped(page):
+    assert "RuntimeError: &lt;out&gt; of luck" in page
+
+
+def test_a_page_of_failures_alone_is_made_too(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "config.yaml").write_text("")
+    write_page(tmp_path, tmp_path / "index.html")
+    assert "stopped, or still running" in (tmp_path / "index.html").read_text()
+
+
+def test_figures_are_whole_svg_in_the_pages_colours():
+    band = np.array([1.0, 2.0]), np.array([0.5, 1.5]), np.array([1.5, 2.5])
+    line = figures.Line("wpt", np.array([0.0, 10.0]), band)
+    drawn = figures.lines("a & b", "x", "y", [line], ["wpt"])
+    root = ElementTree.fromstring(drawn.replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"'))
+    assert root.get("aria-label") == "a & b"
+    colours = set(re.findall(r"(?:fill|stroke): ([^;\"]+)", drawn)) - {"none"}
+    assert colours == {"var(--series-1)", "var(--ink)", "var(--muted)", "var(--line)"}
+
+
+def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
+    tasks = ["dmc-walker-run", "dmc-walker-stand"]  # 728.0 and 969.4 in Table 5
+    given = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
+    assert given["mean"] == pytest.approx((0.728 + 0.9694) / 2)
+    assert aggregates.paper_aggregate("dmc", tasks, "no-rehearsal", 150_000) == {}
+
+
+def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
+    used = {variable for variable in figures.VARIABLES.values() if "series" in variable}
+    assert len(used) == len(figures.SERIES) >= len(METHODS)
+    for variable in used:
+        assert page.count(f"{variable[4:-1]}: #") == 2
+    template = Path(figures.__file__).with_name("page.html.jinja").read_text()
+    assert f"% {len(figures.SERIES)} + 1" in template  # the key's
+
+
+def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart():
+    high, low, wide, single = [9, 10, 11], [1, 2, 3], [0, 2, 10], [1]
+    assert sections.above(high, low) and not sections.above(low, high)
+    assert not sections.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
+    assert not sections.above(high, single) and not sections.above(single, low)
+
+
+def test_the_headline_compares_successes_where_they_are_the_score(tmp_path):
+    for seed in range(3):  # 4.9 and less is no success
+        make_run(tmp_path, "metaworld-reach", seed, "wpt", (4.9 - seed / 100, 4.9))
+        make_run(tmp_path, "metaworld-reach", seed, "scratch", (0.0, 5.1 + seed / 100))
+    [told] = sections.headline(read_results(tmp_path))
+    against = {each["name"]: (each["above"], each["below"]) for each in told["against"]}
+    assert against == {"random policy": (0, 0), "prior actor": (0, 0), "same, from scratch": (0, 1)}
+
+
+def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
+    make_run(tmp_path / "a", "metaworld-reach", returns=(9.0, 1.0))
+    make_run(tmp_path / "b", "dmc-walker-run", returns=(100.0, 100.0), frames=1000)
+    make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
+    [told] = sections.both_suites(read_results(tmp_path))
+    assert told["ours"] == pytest.approx((0.5 + 0.1) / 2)

@@ -1,0 +1,246 @@
+import csv
+import re
+from statistics import mean, median
+
+import pytest
+from debug_agent import recorded
+
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.plan.plan import make_plan, parse_seeds, presets
+from wpt_agents.zoo.plan.presets import (
+    load_preset,
+    preset_folder,
+    preset_names,
+    read_yaml,
+    suite_names,
+)
+from wpt_agents.zoo.plan.tasks import find_tasks
+
+ALL = [(suite, name) for suite in suite_names() for name in preset_names(suite)]
+
+
+@pytest.mark.parametrize(("suite", "name"), ALL)
+def test_every_preset_holds_valid_keywords_and_tasks_that_exist(suite, name):
+    preset = load_preset(suite, name)
+    rows = find_tasks(suite, preset.collect.tasks)
+    assert suite != "dmc" or len({row.embodiment for row in rows}) >= 2  # several robots
+    assert preset.wpt["max_action_dim"] >= max(row.action_dim for row in rows)
+
+
+def test_the_paper_preset_is_table_2():
+    preset = load_preset("dmc", "paper")
+    table = {
+        "size": "paper",
+        "batch_size": 16,
+        "batch_length": 64,
+        "guidance": "linear(1,0,50000)",
+        "offline_ratio": 0.25,
+        "gamma": 0.99,
+        "lam": 0.95,
+        "ent_coef": 1e-4,
+        "imagine_horizon": 16,
+    }
+    assert {key: preset.wpt[key] for key in table} == table
+    assert (preset.pretrain.steps, preset.learn.frames) == (200_000, 150_000)
+    assert preset.wpt["warmup_steps"] * preset.env.action_repeat == 15_000
+
+
+def test_frames_become_calls_of_step_by_the_action_repeat():
+    assert load_preset("dmc", "debug", ["learn.frames=150_000"]).steps == 75_000
+    given = ["learn.frames=150_000", "env.action_repeat=4"]
+    assert load_preset("dmc", "debug", given).steps == 37_500
+
+
+def test_settings_change_keywords_and_sections():
+    preset = load_preset("dmc", "debug", ["gamma=0.9", "collect.tasks=[a, b]", "pretrain.steps=7"])
+    assert (preset.wpt["gamma"], preset.collect.tasks) == (0.9, ("a", "b"))
+    assert preset.pretrain.steps == 7
+
+
+def test_numbers_without_a_dot_in_the_exponent_are_numbers():
+    assert read_yaml("[1e-4, 3E+2, 4e4, -1e-3, 1_0e1]") == [1e-4, 300, 40_000, -1e-3, 100]
+
+
+def test_yaml_runs_no_code():
+    with pytest.raises(presets.yaml.YAMLError):
+        read_yaml("!!python/object/apply:os.system ['true']")
+
+
+@pytest.mark.parametrize(
+    ("suite", "name", "settings", "message"),
+    [
+        ("dmv", "demo", [], "'dmv'.*Did you mean 'dmc'"),
+        ("dmc", "demmo", [], "'demmo'.*Did you mean 'demo'"),
+        ("dmc", "demo", ["gama=0.9"], "'gama'.*Did you mean 'gamma'"),
+        ("dmc", "demo", ["learn.frame=1"], "learn key 'frame'.*Did you mean 'frames'"),
+        ("dmc", "demo", ["lern.frames=1"], "section 'lern'.*Did you mean 'learn'"),
+        ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),
+        ("dmc", "demo", ["learn.frames=many"], "learn.frames must be of type int, got 'many'"),
+        ("dmc", "demo", ["learn.frames=1"], "at least 1, got 1 / 2"),
+        ("dmc", "demo", ["evaluate.episodes=0"], "evaluate.episodes.*at least 1"),
+        ("dmc", "demo", ["pretrain.steps=-1"], "pretrain.steps must not be negative"),
+        ("dmc", "demo", ["pretrain.steps=0"], "pretrain.steps must be at least 1, got 0"),
+        ("dmc", "demo", ["evaluate.during_episodes=0"], "during_episodes must be at least 1"),
+        ("dmc", "demo", ["seed=1"], "'seed'"),
+        ("dmc", "demo", ["gamma"], "key=value"),
+    ],
+)
+def test_what_does_not_exist_is_answered_with_the_nearest(suite, name, settings, message):
+    with pytest.raises(ValueError, match=message):
+        load_preset(suite, name, settings)
+
+
+def test_a_suite_file_with_a_wrong_key_names_it(tmp_path, monkeypatch):
+    (tmp_path / "dmc.yaml").write_text("default: {wpt: {gamme: 1}}\npresets: {demo: {}}\n")
+    monkeypatch.setattr(presets, "preset_folder", lambda: tmp_path)
+    with pytest.raises(ValueError, match=r"WPT keyword 'gamme'.*Did you mean 'gamma'"):
+        load_preset("dmc", "demo")
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3", [0, 1, 2]), ("0,5", [0, 5]), ("2-4", [2, 3, 4]), ("1,3-4", [1, 3, 4])]
+)
+def test_seeds_are_how_many_or_which(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "0", "x", "1-", "3-1"])
+def test_seeds_that_are_none_are_refused(text):
+    with pytest.raises(ValueError, match="how many"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        (["walker-run"], ["walker-run"]),
+        (["dmc-walker-run"], ["walker-run"]),
+        (["wpt/dmc-walker-run-v0"], ["walker-run"]),
+        (["acrobot-*"], ["acrobot-swingup", "acrobot-swingup-sparse", "acrobot-swingup-hard"]),
+    ],
+)
+def test_tasks_are_found_by_name_id_or_pattern(patterns, names):
+    assert [row.name for row in find_tasks("dmc", patterns)] == names
+
+
+def test_no_pattern_means_the_papers_22_tasks():
+    assert len(find_tasks("dmc", [])) == 22
+    assert len(find_tasks("robotics", [])) == 12  # none of which is the paper's
+
+
+@pytest.mark.parametrize(("suite", "name"), [("dmc", "walker-rum"), ("dmd", "walker-run")])
+def test_an_unknown_task_or_suite_is_answered_with_the_nearest(suite, name):
+    with pytest.raises(ValueError, match=r"Did you mean '(walker-run|dmc)'"):
+        find_tasks(suite, [name])
+
+
+def reference(numbers, method, samples):
+    """The scores of a method's tasks, and the printed mean and median."""
+    scores, printed = [], {}
+    for number in numbers:
+        with open(preset_folder() / "references" / f"table{number}.csv") as file:
+            for row in csv.DictReader(file):
+                if (row["method"], row["samples"]) != (method, str(samples)) or not row["score"]:
+                    continue
+                if row["task"] in ("mean", "median"):
+                    printed[row["task"]] = float(row["score"])
+                else:
+                    scores.append(float(row["score"]))
+    return scores, printed
+
+
+@pytest.mark.parametrize(
+    ("method", "samples"),
+    [("wpt", 150_000), ("drq-v2", 150_000), ("dreamer-v3", 150_000), ("dreamer-v3", 500_000)],
+)
+def test_table_5_adds_up_to_its_printed_mean_and_median(method, samples):
+    scores, printed = reference([5], method, samples)
+    assert len(scores) == 22
+    assert mean(scores) == pytest.approx(printed["mean"], abs=0.01)
+    assert median(scores) == pytest.approx(printed["median"], abs=0.01)
+
+
+def test_tables_3_and_4_have_50_tasks_and_a_misprinted_mean():
+    scores, printed = reference([3, 4], "wpt", 150_000)
+    assert len(scores) == 50
+    assert mean(scores) == pytest.approx(0.7536)
+    scores, printed = reference([3, 4], "dreamer-v3", 1_000_000)
+    assert mean(scores) == pytest.approx(0.656, abs=0.001)
+    assert printed["mean"] == 0.9  # the paper's print
+
+
+def test_every_reference_names_a_task_that_exists_and_its_source():
+    for number, suite in ((3, "metaworld"), (4, "metaworld"), (5, "dmc")):
+        with open(preset_folder() / "references" / f"table{number}.csv") as file:
+            for row in csv.DictReader(file):
+                assert row["source"].endswith(f"Table {number}")
+                assert row["task"] in ("mean", "median") or find_tasks(suite, [row["task"]])
+
+
+def plan(suite, tasks, preset, tmp_path, method="wpt", settings=(), data=None):
+    return make_plan(suite, tasks, preset, "1", [method], settings, tmp_path, 1, "cpu", data)
+
+
+@pytest.mark.parametrize("suite", suite_names())
+@pytest.mark.parametrize("preset", ["debug", "paper"])
+def test_a_whole_suite_can_be_run_from_its_presets_own_data(suite, preset, tmp_path):
+    assert plan(suite, [], preset, tmp_path)
+
+
+def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
+    settings = ["max_action_dim=12"]
+    with pytest.raises(ValueError, match=r"quadruped-walk has 12 actions.*\(1, 6\).*collect.tasks"):
+        plan("dmc", ["quadruped-walk"], "demo", tmp_path, settings=settings)
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch", settings)
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "pretrain-only", settings)
+    with TrajectoryDataset.create(tmp_path / "own") as dataset:
+        dataset.append(recorded(actions=12))
+    own = dict(settings=settings, data=tmp_path / "own")
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, **own)
+    with pytest.raises(ValueError, match=r"walker-walk has 6 actions.*\(12\)"):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, **own)
+
+
+def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
+    settings = ["collect.tasks=[dmc-quadruped-run, dmc-walker-walk]"]
+    with pytest.raises(ValueError, match=r"The data have 12 actions.*6: --set max_action_dim=12"):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, settings=settings)
+    assert plan("dmc", ["walker-walk"], "demo", tmp_path, "scratch", settings)
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [("retrieval=nearst", "nearest"), ("guidance=foo", "guidance='foo'"), ("size=tny", "tiny")],
+)
+def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, told, tmp_path):
+    with pytest.raises(ValueError, match=told):
+        plan("dmc", ["walker-walk"], "demo", tmp_path, settings=[setting])
+
+
+def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_path):
+    with pytest.raises(ValueError, match=r"has 12 actions.*is 6: --set max_action_dim=12"):
+        plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch")
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "message"),
+    [
+        ("wpt", ["env.rendering=fats"], "Did you mean 'fast'"),
+        ("wpt", ["collect.behaviour=nois"], "Did you mean 'noise'"),
+        ("wpt", ["collect.behaviour=policy"], "No collect.behaviour 'policy'"),
+        ("kickstart", ["kickstart=5"], "--set kickstart=5 would have no effect"),
+        ("scratch", ["guidance=linear(1,0,9)"], "--method scratch means guidance=0.0"),
+    ],
+)
+def test_what_a_run_would_stumble_over_or_overrule_is_refused_beforehand(
+    tmp_path, method, settings, message
+):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        plan("dmc", ["walker-run"], "debug", tmp_path, method, settings)
+
+
+def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_path):
+    methods, settings = ["scratch", "scratch"], ["gamma=0.98", "gamma=0.9"]
+    given = "dmc", ["walker-run"], "debug", "1", methods, settings
+    [one] = make_plan(*given, tmp_path, 1, "cpu")
+    assert (one.wpt["gamma"], one.label) == (0.9, "debug gamma=0.9")

@@ -1,0 +1,181 @@
+"""The record of results: what stands in it, how it grows, what it says together."""
+
+from pathlib import Path
+
+import pytest
+from run_folders import make_run
+from typer.testing import CliRunner
+
+from wpt_agents.zoo.__main__ import app
+from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.report.folders import find_finished
+
+
+def lines_of(folder):
+    return record.lines_of(find_finished(folder))
+
+
+def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc", preset="tiny"):
+    return record.Line(suite, task, method, seed, preset, frames, score, 0, None, 0, "c", "x")
+
+
+def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", seed=2, returns=(300.0, 500.0), preset="tiny size=debug")
+    make_run(tmp_path, "metaworld-reach", returns=(3.0, 9.0, 9.0, 9.0), method="no-pretrain")
+    lines = {(each.task, each.method): each for each in lines_of(tmp_path)}
+    walker = lines["dmc-walker-run", "wpt"]
+    assert (walker.score, walker.return_, walker.success) == (40, 400, None)
+    assert (walker.hours, walker.commit) == (pytest.approx(2 / 3600, abs=1e-4), "0123456789ab")
+    assert walker.command == (
+        "python -m wpt_agents.zoo run --suite dmc --tasks dmc-walker-run --method wpt "
+        "--preset tiny --frames 1000 --seeds 2-2 --set size=debug"
+    )
+    reach = lines["metaworld-reach", "no-pretrain"]
+    assert (reach.score, reach.success) == (75, 0.75)
+    assert {m for task, m in lines if task == "dmc-walker-run"} == {
+        *("nothing", "random", "prior actor", "wpt")
+    }
+
+
+def test_data_of_ones_own_are_in_the_command():
+    result = {"suite": "dmc", "task": "t", "method": "wpt", "seed": 0, "frames": 10}
+    changes = "data=my/own 'collect.tasks=[a, b]' 'guidance=linear(1,0,9)'"
+    told = record.command(result | {"preset": f"tiny {changes}"})
+    assert told.endswith(
+        "--data my/own --set 'collect.tasks=[a, b]' --set 'guidance=linear(1,0,9)'"
+    )
+
+
+def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
+    names = [("WPT", "scratch"), ("WPT, last", "wpt"), ("prior actor", "no-pretrain")]
+    names += [("prior actor", "kickstart"), ("WPT", "kickstart")]
+    told = [record._method(*each) for each in names]
+    assert told[:3] == ["scratch", "wpt, last", "prior actor, no-pretrain"]
+    assert told[3:] == ["prior actor", "kickstart"]  # the same clone as wpt's
+
+
+def test_untrained_policies_are_told_apart_by_how_they_are_played(tmp_path):
+    for preset in ("demo", "debug", "demo size=tiny", "demo evaluate.episodes=3"):
+        make_run(tmp_path, "dmc-walker-run", method="scratch", preset=preset)
+    lines = [each.preset for each in lines_of(tmp_path) if each.method == "random"]
+    assert lines == ["debug", "demo", "demo evaluate.episodes=3"]
+
+
+def test_budgets_are_kept_apart_where_there_is_no_run_of_wpt():
+    lines = [line("scratch", 10.0, frames=100), line("scratch", 90.0, frames=300)]
+    lines += [line("scratch", 50.0, frames=900, preset="small"), line("random", 1.0, frames=0)]
+    means = record.by_suite(lines)
+    found = {method: cell.mean for method, suites in means.items() for _, cell in suites.values()}
+    assert found == {
+        **{"random": 1.0, "scratch": 10.0, "scratch, 3x frames": 90.0},
+        "scratch, 9x frames, small": 50.0,
+    }
+
+
+def test_a_record_of_another_suffix_is_refused_before_anything_is_written(tmp_path):
+    make_run(tmp_path / "runs", "dmc-walker-run")
+    for name in ("record.md", "record.png", "record"):
+        words = ["report", str(tmp_path / "runs"), "--record", str(tmp_path / name)]
+        assert "a record is a .csv" in str(CliRunner().invoke(app, words).exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_record_grows_and_replaces_the_same_run(tmp_path):
+    path = tmp_path / "small.csv"
+    first = [line("wpt", 1.5), line("wpt", 2.0, seed=1)]
+    assert record.update(path, first) == record.read(path) == first
+    again = record.update(path, [line("wpt", 9.0, seed=1), line("scratch", 3.0)])
+    assert [(each.method, each.score) for each in again] == [
+        *[("scratch", 3.0), ("wpt", 1.5), ("wpt", 9.0)]
+    ]
+    assert path.read_text().splitlines()[0] == (
+        "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command"
+    )
+
+
+def test_presets_are_kept_apart():
+    lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
+    assert len({each.run for each in lines}) == 3
+    assert set(record.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
+    assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record.markdown(lines)
+
+
+def test_another_csv_is_refused(tmp_path):
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match=r"other.csv is no record.*its columns are suite"):
+        record.read(tmp_path / "other.csv")
+
+
+def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
+    lines = [
+        *[line("wpt", 0.0, f"dmc-{i}", seed) for i in range(3) for seed in range(2)],
+        *[line("wpt", score, "mw-a", seed, 50, "mw") for seed, score in enumerate((80.0, 100.0))],
+        *[line("scratch", 30.0, "mw-a", 0, 150, "mw"), line("random", 7.0, "mw-a", 0, 0, "mw")],
+    ]
+    found = record.by_suite(lines)
+    assert found["wpt"]["dmc"][0] == 3 and found["wpt"]["mw"][1].mean == 90
+    both = found["wpt"]["both"][1]
+    assert (both.mean, both.low, both.high) == (45, 40, 50)
+    assert found["scratch, 3x frames"]["mw"][1].low is None  # of one seed
+    fewer = record.by_suite([each for each in lines if (each.task, each.seed) != ("dmc-0", 1)])
+    assert fewer["wpt"]["mw"][1].low == 80 and fewer["wpt"]["both"][1].low is None  # one of them
+    assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
+
+
+def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
+    for seed in range(2):
+        make_run(tmp_path / "runs", "dmc-walker-run", seed, returns=(300.0, 500.0))
+    path = tmp_path / "small.csv"
+    ran = CliRunner().invoke(app, ["report", str(tmp_path / "runs"), "--record", str(path)])
+    assert ran.exit_code == 0, ran.output
+    assert len(record.read(path)) == 8
+    assert "| dmc-walker-run | wpt | debug | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 | 400 |" in (
+        path.with_suffix(".md").read_text()
+    )
+    assert path.with_suffix(".png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("form", ["--markdown", "--csv"])
+def test_a_record_is_kept_whatever_is_printed(tmp_path, form):
+    make_run(tmp_path / "runs", "dmc-walker-run")
+    path = tmp_path / "small.csv"
+    words = ["report", str(tmp_path / "runs"), form, "--record", str(path)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert len(record.read(path)) == 4
+
+
+def test_three_suites_have_no_mean_of_both():
+    lines = [line("wpt", 1.0, task=suite, suite=suite) for suite in ("dmc", "mw", "robotics")]
+    assert set(record.by_suite(lines)["wpt"]) == {"dmc", "mw", "robotics"}
+
+
+def test_the_pages_rows_are_the_records():
+    root = Path(__file__).parents[2]
+    told = record.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
+    assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()
+    page = (root / "docs" / "small-benchmark.md").read_text().splitlines()
+    rows = [line for line in page if line.startswith(("| dmc", "| metaworld", "| both |"))]
+    assert len(rows) > 30 and set(rows) <= set(told.splitlines())
+
+
+def test_methods_are_told_from_doing_nothing_to_ours():
+    assert set(METHODS) < set(record.ORDER)
+    told = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
+    lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(told)]
+    shown = sorted(lines, key=record._order)
+    assert [(x.task, x.method) for x in shown] == [(task, m) for task in "ab" for m in told]
+    assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]
+
+
+def test_a_method_of_two_presets_is_drawn_with_what_was_changed():
+    keys = [("scratch", "tiny", 10), ("wpt", "tiny", 10), ("wpt", "tiny train_ratio=64", 10)]
+    assert record._names(keys) == ["scratch", "wpt", "wpt,\ntrain_ratio=64"]
+    assert record._names([*keys, ("wpt", "tiny", 30)])[1] == "wpt, 10 frames"
+    others = [("wpt", "tiny", 10), ("wpt", "small", 10)]
+    assert record._names(others) == ["wpt,\ntiny", "wpt,\nsmall"]
+
+
+def test_a_method_of_two_budgets_is_drawn_with_both():
+    keys = [("nothing", "", 0), ("scratch", "tiny", 100), ("scratch", "tiny", 3000)]
+    assert record._names(keys) == ["nothing", "scratch, 100 frames", "scratch, 3,000 frames"]

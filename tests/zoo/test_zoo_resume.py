@@ -1,0 +1,288 @@
+"""A run that is killed goes on where it stood, and ends as if nothing had happened."""
+
+import fcntl
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from debug_agent import same, weights
+from stable_baselines3.common.logger import configure
+from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.model_file import read_model
+from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
+from wpt_agents.zoo.run import benchmark, stages
+from wpt_agents.zoo.run.benchmark import run
+from wpt_agents.zoo.run.checkpoints import last_checkpoint
+from wpt_agents.zoo.run.progress import LearningBar
+from wpt_agents.zoo.run.stages import locked
+
+CHANGES = {
+    "learn": {"frames": 150, "checkpoint_every": 25},
+    "evaluate": {"episodes": 2, "every": 25, "during_episodes": 2, "keep_best": True},
+}
+
+
+class Killed(BaseException):
+    """What a SIGKILL is to the process, for one that the test has to outlive."""
+
+
+class KillAt(LearningBar):
+    def __init__(self, step):
+        super().__init__(frames_a_step=1)
+        self.step = step
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            raise Killed
+        return super()._on_step()
+
+
+def killed_at(step, monkeypatch, one):
+    """Does the run until `step`, and no more."""
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark, "LearningBar", lambda _: KillAt(step))
+        with pytest.raises(Killed):
+            run(one)
+
+
+def left(folder):
+    """All that a run leaves, clocks apart."""
+    _, tensors = read_model(folder / "model.zip")
+    flat = {f"{g}/{k}": v.numpy() for g, each in tensors.items() for k, v in each.items()}
+    rows = np.genfromtxt(folder / "progress.csv", delimiter=",", names=True)
+    flat |= {n: rows[n] for n in rows.dtype.names if n != "timefps"}
+    monitor = np.genfromtxt(folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
+    flat |= {"returns": monitor["r"], "lengths": monitor["l"]}
+    with np.load(folder / "evaluations.npz") as held:
+        flat |= {n: held[n] for n in held.files}
+    scores = json.loads((folder / "result.json").read_text())["scores"]
+    return flat | {name: np.array(score["returns"]) for name, score in scores.items()}
+
+
+def assert_equal(one, other):
+    assert one.keys() == other.keys()
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, other[name], err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["wpt", "scratch"])
+def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeypatch, capsys):
+    whole, broken = job(tmp_path / "whole", method, **CHANGES), job(tmp_path, method, **CHANGES)
+    run(whole)
+    for step in (40, 76, 149):
+        killed_at(step, monkeypatch, broken)
+    run(broken)
+    assert "continued at 125 of" in capsys.readouterr().out
+    assert_equal(left(broken.folder), left(whole.folder))
+    assert not (broken.folder / "replay").exists()
+
+
+def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch, capsys):
+    changes = {"env": {"action_repeat": 2}, "learn": {"frames": 150, "checkpoint_every": 50}}
+    one = job(tmp_path, "scratch", **changes)
+    killed_at(60, monkeypatch, one)
+    run(one)
+    assert "continued at 100 of 150 frames, 75 steps" in capsys.readouterr().out
+
+
+def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+        with pytest.raises(Killed):
+            run(one)
+    before = weights(WPT.load(one.folder / "model.zip"))
+    monkeypatch.setattr("wpt_agents.agents.wpt.WPT.update", lambda *_: pytest.fail("learns again"))
+    run(one)
+    assert same(weights(WPT.load(one.folder / "model.zip")), before)
+
+
+def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    names = sorted(path.name for path in (one.folder / "checkpoints").iterdir())
+    assert names == ["step-000000075", "step-000000100"]
+    damaged = one.folder / "checkpoints" / names[1] / "model.zip"
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
+    with pytest.warns(UserWarning, match="step-000000100 is damaged"):
+        assert last_checkpoint(one.folder).folder.name == names[0]
+
+
+def test_what_came_after_the_checkpoint_is_forgotten(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    shutil.rmtree(one.folder / "checkpoints" / "step-000000100")
+    checkpoint = last_checkpoint(one.folder)
+    checkpoint.restore_logs(one.folder)
+    assert (one.folder / "0.monitor.csv").read_text().count("\n") == 2 + 3
+    with np.load(one.folder / "evaluations.npz") as held:
+        assert held["timesteps"].tolist() == [25, 50, 75]
+    model = WPT.load(checkpoint.model)
+    model.set_logger(configure(str(tmp_path / "log"), []))
+    assert len(list((one.folder / "replay").iterdir())) == 4
+    checkpoint.restore(model, one.folder)
+    assert (
+        len(list((one.folder / "replay").iterdir())) == len(model.replay_buffer.trajectories) == 3
+    )
+
+
+def test_a_run_that_another_process_works_on_is_refused(tmp_path):
+    one = job(tmp_path)
+    one.folder.mkdir(parents=True)
+    with locked(one.folder / "lock"), pytest.raises(ValueError, match="by another process"):
+        run(one)
+
+
+def test_who_only_looks_whether_a_run_is_locked_does_not_keep_it_from_starting(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(stages, "PATIENCE", 10)
+    with open(tmp_path / "lock", "w") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN)).start()
+        with locked(tmp_path / "lock"):
+            pass
+
+
+def test_force_does_not_walk_into_a_run_that_another_process_works_on(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(60, monkeypatch, one)
+    before = sorted(one.folder.rglob("*"))
+    with locked(one.folder / "lock"), pytest.raises(ValueError, match="by another process"):
+        run(one, force=True)
+    assert sorted(one.folder.rglob("*")) == before
+
+
+def test_leftovers_of_checkpoints_that_cannot_be_used_make_way(tmp_path, monkeypatch):
+    one = job(tmp_path, **CHANGES)
+    killed_at(110, monkeypatch, one)
+    (one.folder / "replay" / "episode-000000.zip").unlink()
+    with pytest.warns(UserWarning, match="damaged and passed over"):
+        killed_at(30, monkeypatch, one)
+    assert [p.name for p in (one.folder / "checkpoints").iterdir()] == ["step-000000025"]
+    assert len(list((one.folder / "replay").iterdir())) == 1
+
+
+def test_the_checkpoint_at_the_end_is_not_written_twice(tmp_path, monkeypatch):
+    one, written = job(tmp_path, learn={"frames": 150, "checkpoint_every": 0}), []
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+            with pytest.raises(Killed):
+                run(one)
+        (state,) = one.folder.glob("checkpoints/*/state.json")
+        written.append((state.stat().st_ino, state.stat().st_mtime_ns))
+    assert written[0] == written[1]
+
+
+def test_training_and_evaluation_share_no_episode(tmp_path):
+    for seed in range(20):
+        one = job(tmp_path, seed=seed)
+        training = EpisodeSeeds(gym.make(DOT.id, action_repeat=1, rendering="fast"))
+        training.reset(seed=seed)
+        seeds = {seed} | {training.next_seed() for _ in range(200)}
+        final = {one.evaluation_seed + i for i in range(100)}
+        assert not seeds & final
+
+
+def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monkeypatch):
+    shared = job(tmp_path).shared
+    dataset, folder = shared.data(), shared.model_path
+
+    def other():
+        with locked(folder / "lock"):
+            begun.set()
+            time.sleep(0.3)
+            (folder / "done.json").write_text("{}")
+
+    begun, thread = threading.Event(), threading.Thread(target=other)
+    thread.start()
+    begun.wait()
+    monkeypatch.setattr(WPT, "pretrain", lambda *_, **__: pytest.fail("pre-trained twice"))
+    assert shared.model(dataset) == folder / "model.zip"
+    thread.join()
+
+
+def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("wpt_agents.training.pretraining.EVERY", 100)
+    shared, update = job(tmp_path, pretrain={"steps": 300}).shared, WPT._update_world_model
+    dataset, taken = shared.data(), []
+
+    def dying(*args):
+        taken.append(0)
+        if len(taken) == 180:
+            raise Killed
+        return update(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WPT, "_update_world_model", dying)
+        with pytest.raises(Killed):
+            shared.model(dataset)
+    assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 3
+    shared.model(dataset)
+    assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 6
+
+
+def test_an_unfinished_run_of_other_settings_is_refused(tmp_path, monkeypatch):
+    killed_at(60, monkeypatch, job(tmp_path, **CHANGES))
+    with pytest.raises(ValueError, match=r"other settings.*wpt"):
+        run(job(tmp_path, wpt={"gamma": 0.9}, **CHANGES))
+
+
+def test_an_episode_depends_on_its_number_and_on_none_before_it():
+    settings = {"action_repeat": 1, "rendering": "fast"}
+    one, other = (make_vec_env(DOT.id, settings, seed=3) for _ in range(2))
+    images = [one.reset() for _ in range(4)]
+    assert len({image.tobytes() for image in images}) == 4
+    other.env_method("go_to_episode", 2)
+    np.testing.assert_array_equal(other.reset(), images[2])
+    np.testing.assert_array_equal(other.reset(), images[3])
+
+
+SCRIPT = """
+import sys; sys.path.insert(0, {tests!r})
+from pathlib import Path
+import test_zoo, gymnasium
+from wpt_envs.tasks import TASKS
+from test_zoo_resume import CHANGES
+TASKS[test_zoo.DOT.id] = test_zoo.DOT
+gymnasium.register(test_zoo.DOT.id, entry_point=test_zoo.make_dot)
+test_zoo.run(test_zoo.job(Path({out!r}), **CHANGES))
+"""
+
+
+def test_sigkill_at_random_moments_costs_nothing_that_was_kept(tmp_path):
+    whole, broken = job(tmp_path / "whole", **CHANGES), job(tmp_path / "broken", **CHANGES)
+    run(whole)
+    script = SCRIPT.format(
+        tests=str(Path(__file__).parents[1] / "helpers"), out=str(tmp_path / "broken")
+    )
+    rng, monitor = random.Random(0), broken.folder / "0.monitor.csv"
+    for episodes in (1, 2, 4, None):  # after which it is killed, at some moment of the next one
+        child = subprocess.Popen(
+            [sys.executable, "-c", script],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        if episodes is not None:
+            while not monitor.exists() or monitor.read_text().count("\n") < 2 + episodes:
+                assert child.poll() is None, child.communicate()
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0, 0.2))
+            child.send_signal(signal.SIGKILL)
+        _, said = child.communicate(timeout=300)
+        assert child.returncode == (0 if episodes is None else -signal.SIGKILL), said.decode()
+    assert_equal(left(broken.folder), left(whole.folder))

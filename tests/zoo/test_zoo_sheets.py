@@ -1,0 +1,114 @@
+"""A look at the data: the table's numbers, and that the pictures show what they say."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from debug_agent import agent, recorded
+from PIL import Image
+from toy_env import DotEnv
+from wpt_envs.tasks import find
+from zoo_command import call
+
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.zoo.pictures import sheets
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Three dots and two arms, of which each embodiment has its colour."""
+    with TrajectoryDataset.create(tmp_path / "data") as made:
+        for seed in range(3):
+            made.append(recorded(8 + seed, seed, embodiment="dot", task=f"push-{seed}"))
+        for seed in range(2):
+            image = np.full((6, 64, 64, 3), (200, 0, 10 * seed), np.uint8)
+            action = np.zeros((5, 4), np.float32)
+            made.append(Trajectory(image, action, np.zeros(5), embodiment="arm", task="reach"))
+    return TrajectoryDataset.open(tmp_path / "data")
+
+
+def test_the_table_counts_robot_by_robot_and_all(dataset):
+    table = sheets.data_table(dataset)
+    rows = {
+        cells[0]: cells[1:]
+        for cells in zip(*(list(column.cells) for column in table.columns), strict=True)
+    }
+    # tasks, trajectories, transitions, action width, length, with reward
+    assert rows["dot"][:6] == ("3", "3", "27", "2", "8 to 10", "0")
+    assert rows["arm"][:6] == ("1", "2", "10", "4", "5", "2")
+    assert rows["all"][:6] == ("4", "5", "37", "2, 4", "5 to 10", "2")
+    stored = sum(p.stat().st_size for p in dataset.path.glob("shard-*"))
+    assert float(rows["all"][6]) == pytest.approx(stored / 2**20, abs=0.06)
+    assert int(rows["all"][7]) == pytest.approx(stored / 42, abs=1)  # 37 + 5 images
+
+
+def test_what_is_shown_is_of_every_kind_first(dataset):
+    assert sheets.spread(dataset, 2) == [0, 3]
+    assert sheets.spread(dataset, 4) == [0, 1, 2, 3]
+    assert sorted(sheets.spread(dataset, 99)) == [0, 1, 2, 3, 4]
+    only = dataset.subset([0, 3, 4])
+    assert sheets.spread(only, 3) == [0, 1, 2]
+
+
+def test_data_show_prints_the_table_and_draws_the_images(dataset, tmp_path, monkeypatch, capsys):
+    assert call(monkeypatch, "data", "show", dataset.path, "--out", tmp_path / "sheet.png") == 0
+    told = capsys.readouterr().out
+    assert "arm" in told and "37" in told and str(tmp_path / "sheet.png") in told.replace("\n", "")
+    assert {(200, 0, 0), (200, 0, 10), (30, 30, 30)} <= colours(tmp_path / "sheet.png")
+
+
+def colours(path):
+    return set(map(tuple, np.array(Image.open(path).convert("RGB")).reshape(-1, 3).tolist()))
+
+
+def test_a_folder_that_is_no_dataset_is_named(tmp_path, monkeypatch, capsys):
+    assert call(monkeypatch, "data", "show", tmp_path / "nowhere") == 2
+    assert "nowhere does not exist" in capsys.readouterr().err
+
+
+def test_a_search_leaves_the_query_out_and_keeps_to_its_robot_if_told_to(dataset):
+    model = agent(DotEnv(), dataset=dataset)
+    query = sheets.query_of(dataset, 3)
+    near, distances = sheets.search(model, query, 4, own_robot=False)[1:]
+    assert near[0] == 4 and 3 not in near and sorted(near) == [0, 1, 2, 4]
+    assert (np.diff(distances) >= 0).all()
+    assert sheets.search(model, query, 4, own_robot=True).indices.tolist() == [4]
+    with pytest.raises(ValueError, match=r"No trajectory 5: .* holds 5, from 0 on"):
+        sheets.query_of(dataset, 5)
+
+
+def test_a_task_is_searched_for_by_its_first_image():
+    query = sheets.query_at(find("metaworld", "reach"), {"rendering": "fast"})
+    env = gym.make("wpt/metaworld-reach-v0", rendering="fast")
+    np.testing.assert_array_equal(query.image, env.reset(seed=0)[0])
+    assert (query.embodiment, query.action_dim) == ("sawyer", 4)
+
+
+def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, monkeypatch, capsys):
+    agent(DotEnv()).save(tmp_path / "model.zip")
+    words = [dataset.path, "--model", tmp_path / "model.zip", "--out", tmp_path / "found.png"]
+    assert call(monkeypatch, "retrieve", "show", *words, "--query", 3, "--number", 1) == 0
+    assert str(tmp_path / "found.png") in capsys.readouterr().out.replace("\n", "")
+    shown = colours(tmp_path / "found.png")
+    assert {(200, 0, 0), (200, 0, 10)} <= shown  # the query and its nearest
+    assert (30, 30, 30) not in shown  # no dot
+    assert call(monkeypatch, "retrieve", "show", *words) == 0
+    assert (30, 30, 30) in colours(tmp_path / "found.png")
+
+
+def test_datasets_are_checked_and_joined_from_a_terminal(tmp_path, monkeypatch, capsys):
+    for name in ("one", "two"):
+        with TrajectoryDataset.create(tmp_path / name) as dataset:
+            dataset.extend(recorded(seed=i, embodiment=name) for i in range(2))
+    both = tmp_path / "both"
+    assert not call(monkeypatch, "data", "merge", both, tmp_path / "one", tmp_path / "two")
+    assert TrajectoryDataset.open(both).embodiments == ["one", "one", "two", "two"]
+    assert not call(monkeypatch, "data", "validate", both)
+    assert "4 trajectories read, 0 damaged" in capsys.readouterr().out
+    shard = next(both.glob("shard-*.bin"))
+    shard.write_bytes(shard.read_bytes()[:-50])  # the last trajectory's end
+    assert call(monkeypatch, "data", "validate", both) == 1
+    told = capsys.readouterr().out
+    assert "trajectory 3" in told and "4 trajectories read, 1 damaged" in told
+    assert not call(monkeypatch, "data", "validate", both, "--set-aside")
+    assert len(TrajectoryDataset.open(both)) == 3

@@ -1,0 +1,165 @@
+"""A finished run goes anywhere: moved, without its data, by eval, enjoy, push and pull."""
+
+import json
+import re
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from debug_agent import agent, noise
+from hub_stand_in import hub  # noqa: F401  (a fixture)
+from imageio_ffmpeg import count_frames_and_secs
+from run_folders import make_run
+from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
+from zoo_command import call
+
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.actor_critic import lambda_return
+from wpt_agents.zoo.collect.trained import find_trained
+from wpt_agents.zoo.judge.diagnosis import promises
+from wpt_agents.zoo.run.benchmark import run
+from wpt_agents.zoo.run.hub import card, pull, push
+
+
+@pytest.fixture
+def moved(tmp_path):
+    """A finished run elsewhere, its dataset and everything else of where it was made gone."""
+    one = job(tmp_path / "made")
+    result = run(one)
+    shutil.copytree(one.folder, tmp_path / "moved")
+    shutil.rmtree(tmp_path / "made")
+    return tmp_path / "moved", result, one.evaluation_seed
+
+
+def test_a_moved_run_without_its_data_plays_as_it_did(moved):
+    folder, result, seed = moved
+    trained = find_trained(folder)
+    for policy, name in (("wpt", "WPT"), ("prior", "prior actor")):
+        score = trained.evaluate(trained.load(policy), 3, seed)
+        assert score.returns == pytest.approx(result["scores"][name]["returns"])
+
+
+def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
+    folder, _, seed = moved
+    assert call(monkeypatch, "eval", folder, "--episodes", "2", "--seed", seed) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"returns +-?\d", told) and DOT.id in told
+    video = tmp_path / "new" / "video.mp4"
+    assert call(monkeypatch, "enjoy", folder, "--out", video, "--size", "64") == 0
+    assert count_frames_and_secs(video)[0] >= DOT.frames
+    model = shutil.copy(folder / "model.zip", tmp_path / "alone.zip")
+    words = ["--task", "dmc-dot", "--episodes", "1"]
+    assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
+    monkeypatch.setattr(
+        "wpt_agents.zoo.collect.trained._config", lambda _: {"env": SECTIONS["env"]}
+    )
+    assert call(monkeypatch, "eval", model, *words) == 0
+
+
+def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
+    folder, _, seed = moved
+    words = ["--episodes", "2", "--horizon", "10", "--seed", seed]
+    assert call(monkeypatch, "diagnose", folder, *words) == 0
+    told = capsys.readouterr().out
+    assert all(word in told for word in ("earned", "dream of the actor", "discounted return"))
+    rows = re.findall(r"│ +(\d+) │ +(-?[\d.]+) │", told)
+    assert [int(step) for step, _ in rows] == [0, 3, 7, 11, 15]  # five from 0 to 25 - 10
+    returns = find_trained(folder).evaluate(find_trained(folder).load(), 1, seed).returns
+    assert re.search(rf"Returns: {returns[0]:.0f}, ", told)
+    assert call(monkeypatch, "diagnose", folder, "--horizon", "26") == 2
+    assert "shorter --horizon" in capsys.readouterr().err
+
+
+def test_promises_are_of_the_actions_and_rewards_from_the_start_on(monkeypatch):
+    policy, rng = agent(max_action_dim=3).policy, np.random.default_rng(0)
+    action, reward = rng.uniform(-1, 1, (6, 3)).astype(np.float32), np.arange(6, dtype=np.float32)
+    rssm, taken = policy.world_model.rssm, []
+
+    def noted(state, act, horizon, generator):
+        taken.append(torch.stack([act(state, t) for t in range(horizon)], 1))
+        return imagine(state, act, horizon, generator)
+
+    imagine = rssm.imagine
+    monkeypatch.setattr(rssm, "imagine", noted)
+    played = Trajectory(noise(7), action, reward)
+    found = promises(policy, played, 0.5, [0, 4], 2)
+    assert [(p.start, p.earned) for p in found] == [(0, 0.5), (4, 4.5)]
+    # what the critic is taught: image t came with reward t - 1, and the last one pays no more
+    arriving = torch.tensor([[0, *reward.tolist()]])
+    returns = lambda_return(arriving, torch.zeros(1, 8), 0.5, lam=1.0)[0]
+    assert [p.discounted for p in found] == pytest.approx([returns[0].item(), returns[4].item()])
+    assert found[1].discounted == 3 + 0.5 * 4 + 0.25 * 5
+    np.testing.assert_array_equal(taken[0][0], action[:2])
+    np.testing.assert_array_equal(taken[2][0], action[4:])  # taken[1] are the actor's own
+    assert not np.array_equal(taken[1][0], action[:2])
+
+
+def test_a_moved_out_is_not_done_again(tmp_path):
+    result = run(job(tmp_path / "a", "scratch"))
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert run(job(tmp_path / "b", "scratch")) == result
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["eval", "nowhere"], "There is no nowhere"),
+        (["enjoy", "empty"], "holds no model.zip"),
+        (["eval", "alone.zip"], "add --task"),
+        (["eval", "run", "--task", "dmc-walker-rum"], "Did you mean 'walker-run'"),
+        (["enjoy", "run", "--size", "100"], "multiple of 16"),
+        (["eval", "damaged"], "is no run's configuration"),
+        (["push", "run", "noname"], "write user/name"),
+        (["push", "empty", "user/name"], "holds no model.zip"),
+        (["pull", "user/name", "--out", "run"], "is not empty"),
+    ],
+)
+def test_what_cannot_be_played_is_told(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "run", "damaged"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "alone.zip").touch()
+    for name in ("run", "damaged"):
+        (tmp_path / name / "model.zip").touch()
+    about = {"task": "wpt/dmc-walker-run-v0", "env": {}}
+    (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(about))
+    (tmp_path / "damaged" / "config.yaml").write_text("task: [")
+    assert call(monkeypatch, *words) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_hub_is_asked_for_only_when_needed_and_told_if_missing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)  # what a missing module looks like
+    assert call(monkeypatch, "pull", "user/name", "--out", tmp_path / "new") == 2
+    assert 'pip install "wpt-agents[hub]"' in capsys.readouterr().err
+
+
+def test_the_card_tells_scores_command_and_how_to_load(tmp_path):
+    told = card(make_run(tmp_path, "dmc-walker-run", 3, returns=(700.0, 720.0)), "me/walker")
+    about = yaml.safe_load(told.split("---\n")[1])
+    (result,) = about["model-index"][0]["results"]
+    assert result["metrics"][0]["value"] == 710.0
+    assert about["library_name"] == "wpt-agents"
+    for text in ("| WPT | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
+        assert text in told
+
+
+def test_what_was_pushed_is_pulled_the_same(tmp_path, hub):  # noqa: F811
+    folder = make_run(tmp_path, "dmc-walker-run")
+    (folder / "model.zip").write_bytes(b"weights" * 1000)
+    (folder / "checkpoints").mkdir()
+    config = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(config + f"data: {tmp_path}\n")
+    address = push(folder, "me/walker")
+    assert not any(str(tmp_path).encode() in told for told in hub.files["me/walker"].values())
+    (folder / "config.yaml").write_text(config)
+    assert address.endswith("me/walker")
+    assert {"README.md", "replay.mp4", "model.zip", "result.json"} <= hub.files["me/walker"].keys()
+    assert b"model-index" in hub.files["me/walker"]["README.md"]
+    pulled = pull("me/walker", tmp_path / "pulled")
+    for name in ("model.zip", "config.yaml", "result.json", "policy.mp4"):
+        assert (pulled / name).read_bytes() == (folder / name).read_bytes()
+    assert json.loads((pulled / "result.json").read_text())["task"] == "dmc-walker-run"

@@ -1,0 +1,70 @@
+"""Workers end with the process that began them, however that ended."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+PARENT = """
+import os
+import sys
+import time
+
+from wpt_agents.zoo.run.engines import Local, Resources
+from wpt_agents.zoo.collect.workers import worker_pool
+
+
+def wait(path):
+    with open(path, "w") as file:
+        file.write(str(os.getpid()))
+    time.sleep(600)
+
+
+if __name__ == "__main__":
+    START
+    time.sleep(600)
+"""
+STARTS = {
+    "pool": "worker_pool(1).submit(wait, sys.argv[1]).result()",
+    "engine": "Local(Resources()).start(wait, sys.argv[1])",
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes through /proc")
+@pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
+def test_a_worker_ends_with_a_killed_parent(tmp_path, start):
+    script, told = tmp_path / "parent.py", tmp_path / "pid"
+    script.write_text(PARENT.replace("START", start))
+    parent = subprocess.Popen([sys.executable, str(script), str(told)])
+    try:
+        worker = int(until(lambda: told.exists() and told.read_text()))
+        assert alive(worker)
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    try:
+        until(lambda: not alive(worker))
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+
+
+def until(true, seconds=300):
+    """What `true` returns once it is true."""
+    end = time.monotonic() + seconds
+    while not (value := true()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return value
+
+
+def alive(pid):
+    with suppress(ProcessLookupError, FileNotFoundError):
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return state != "Z"  # one that nobody waits for is not alive
+    return False

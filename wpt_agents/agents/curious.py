@@ -1,0 +1,281 @@
+"""Curiosity: data without a task, by ICM (Pathak 2017) or by disagreement (Plan2Explore).
+
+Example::
+
+    explorer = Plan2Explore("WPTPolicy", env, seed=0, **EXPLORE)
+    trajectories = list(explorer.explore(40))
+
+Both are WPT from scratch with the task's reward replaced by surprise: the actor learns to seek it
+in the imagination of its own world model.
+"""
+
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Generator, Tensor, nn
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.trajectory import Batch, Trajectory
+from wpt_agents.model.networks import Encoder, Linear, LinearNorm, Size, frozen
+from wpt_agents.model.policy import Dream
+from wpt_agents.model.rssm import Latent
+from wpt_agents.training.updates import torch_seed
+
+RESET = 100  # a purpose of random streams, beside those of `wpt_agents.training.updates`
+MEMBERS = 5  # of the ensemble, as in Plan2Explore
+
+# Keywords of WPT for exploring: nothing to retrieve, nobody to guide, two random episodes first.
+EXPLORE: Mapping[str, Any] = {
+    "size": "tiny",
+    "batch_size": 8,
+    "batch_length": 32,
+    "train_ratio": 16,  # an update of 8 x 32 replayed steps every 16 collected ones
+    "learning_starts": 1000,
+    "warmup_steps": 1000,
+    "offline_ratio": 0.0,
+    "guidance": 0.0,
+    "ent_coef": 0.3,  # with Table 2's 1e-4 the actor narrows to one pose within ten episodes
+    "gamma": 0.95,
+    "target_fraction": 0.1,
+}
+
+
+class Scale(nn.Module):
+    """Divides by a running mean, so that a reward is about 1 however surprise shrinks."""
+
+    mean: Tensor
+    weight: Tensor
+
+    def __init__(self, keep: float = 0.99) -> None:
+        super().__init__()
+        self.keep = keep
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("weight", torch.zeros(()))
+
+    def see(self, surprise: Tensor) -> None:
+        """Takes one batch into the mean; the first counts in full."""
+        self.mean.mul_(self.keep).add_((1 - self.keep) * surprise.detach().mean())
+        self.weight.mul_(self.keep).add_(1 - self.keep)
+
+    def forward(self, surprise: Tensor) -> Tensor:
+        """(...) -> (...)."""
+        return surprise * (self.weight / self.mean.clamp_min(1e-8))
+
+
+class ICM(nn.Module):
+    """Features that tell which action was taken, and how badly the next ones were foreseen.
+
+    :param size: the widths
+    :param action_dim: the padded action width, A
+    :param forward_share: β of Pathak et al., the forward model's share of the loss
+    """
+
+    def __init__(self, size: Size, action_dim: int, forward_share: float = 0.2) -> None:
+        super().__init__()
+        self.forward_share, features, units = forward_share, size.units, size.units
+        self.encoder = Encoder(size.depth)
+        self.project = Linear(self.encoder.embed_dim, features)
+        self.inverse = nn.Sequential(LinearNorm(2 * features, units), Linear(units, action_dim))
+        self.dynamics = nn.Sequential(
+            LinearNorm(features + action_dim, units), Linear(units, features)
+        )
+        self.scale = Scale()
+
+    def features(self, image: Tensor) -> Tensor:
+        """φ(o): (..., 64, 64, 3) uint8 -> (..., F)."""
+        return self.project(self.encoder(image))
+
+    def forward(self, image: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """The two models on sequences.
+
+        :param image: (B, T, 64, 64, 3) uint8
+        :param action: (B, T, A), what led to each image
+        :return: the actions that the inverse model reads from pairs of images (B, T - 1, A), and
+            the surprise of each next image, the forward model's error (B, T - 1)
+        """
+        before, after = (phi := self.features(image))[:, :-1], phi[:, 1:]
+        read = self.inverse(torch.cat([before, after], -1))
+        foreseen = self.dynamics(torch.cat([before, action[:, 1:]], -1))
+        return read, forward_error(foreseen, after)
+
+
+def forward_error(foreseen: Tensor, features: Tensor) -> Tensor:
+    """Pathak et al. (5), ½ ||φ^(o') - φ(o')||², and by (6) the curiosity: (..., F) -> (...)."""
+    return 0.5 * (foreseen - features).square().sum(-1)
+
+
+def icm_loss(
+    read: Tensor, action: Tensor, surprise: Tensor, within: Tensor, forward_share: float = 0.2
+) -> Tensor:
+    """Pathak et al. (7) without its policy: (1 - β) inverse loss + β forward loss.
+
+    :param read: (..., A), the inverse model's actions; continuous, so their error is squared
+    :param action: (..., A)
+    :param surprise: (...), of `forward_error`
+    :param within: (...) bool, False where the two images are of different episodes
+    """
+    assert read.shape == action.shape and surprise.shape == within.shape, (read.shape, within.shape)
+    each = (1 - forward_share) * (read - action).square().sum(-1) + forward_share * surprise
+    return (each * within).sum() / within.sum().clamp_min(1)
+
+
+class Ensemble(nn.Module):
+    """One-step models that differ in nothing but their first weights and agree where data are.
+
+    :param size: the widths
+    :param action_dim: the padded action width, A
+    :param outputs: width of what they predict, the encoded next image
+    """
+
+    def __init__(self, size: Size, action_dim: int, outputs: int, members: int = MEMBERS) -> None:
+        super().__init__()
+        inputs = size.deter + size.stoch * size.classes + action_dim
+        self.members = nn.ModuleList(
+            nn.Sequential(
+                LinearNorm(inputs, size.units),
+                LinearNorm(size.units, size.units),
+                Linear(size.units, outputs),
+            )
+            for _ in range(members)
+        )
+        self.scale = Scale()
+
+    def forward(self, feat: Tensor, action: Tensor) -> Tensor:
+        """(..., D + S*K), (..., A) -> (members, ..., outputs)."""
+        inputs = torch.cat([feat, action], -1)
+        return torch.stack([member(inputs) for member in self.members])
+
+
+def ensemble_loss(prediction: Tensor, target: Tensor, within: Tensor) -> Tensor:
+    """-log of Gaussians of fixed variance, up to constants, averaged over the members.
+
+    :param prediction: (members, ..., E)
+    :param target: (..., E); no gradient reaches it
+    :param within: (...) bool, False where the target is of another episode
+    """
+    error = (prediction - target.detach()).square().mean(-1)
+    return (error * within).sum() / (len(prediction) * within.sum()).clamp_min(1)
+
+
+def disagreement(prediction: Tensor) -> Tensor:
+    """Sekar et al. (1): the variance over the members, averaged: (members, ..., E) -> (...)."""
+    return prediction.var(0, correction=0).mean(-1)
+
+
+class Explorer(WPT):
+    """WPT from scratch whose reward is curiosity; `curiosity` is saved with the policy."""
+
+    curiosity: nn.Module
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.curiosity = self.policy.curiosity = self._make_curiosity().to(self.device)
+        parts = [list(self.curiosity.parameters())]
+        self.curiosity_optimizer = self._optimizer(parts, float(self.learning_rate))
+
+    def _make_curiosity(self) -> nn.Module:
+        raise NotImplementedError
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "curiosity_optimizer"], variables
+
+    def explore(self, episodes: int) -> Iterator[Trajectory]:
+        """Plays until there are `episodes`, learning after each; yields each with its rewards.
+
+        An episode is a function of the seed and of what is in the replay buffer, so that a loaded
+        explorer with its episodes added goes on as if it had never stopped.
+        """
+        assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
+        _, callback = self._setup_learn(
+            sys.maxsize // 2, None, reset_num_timesteps=False, tb_log_name="explore"
+        )
+        while self.episodes < episodes:
+            self.env.seed(torch_seed(self._stream(RESET, self.episodes)))
+            self._last_obs, self._rollout = self.env.reset(), None  # and no half-played episode
+            self._last_episode_starts = np.ones(1, bool)
+            self._collect(callback, 0)
+            self._update_models()
+            yield self.replay_buffer.trajectories[-1]
+
+
+class ICMExplorer(Explorer):
+    """The reward head learns the forward model's error on real transitions."""
+
+    saved_as = "ICMExplorer"
+    curiosity: ICM
+
+    def _make_curiosity(self) -> ICM:
+        return ICM(self.policy.size, self.max_action_dim)
+
+    def _update_world_model(
+        self,
+        batch: Batch,
+        metrics: dict[str, list[Tensor]],
+        generator: Generator,
+        learn_reward: bool = False,
+    ) -> Latent:
+        icm, within = self.curiosity, ~batch.is_first[:, 1:]
+        with self._autocast():
+            read, surprise = icm(batch.image, batch.action)
+            loss = icm_loss(read, batch.action[:, 1:], surprise, within, icm.forward_share)
+        self._descend(self.curiosity_optimizer, loss, "curiosity")
+        metrics["explore/surprise"].append(surprise.detach().mean())
+        icm.scale.see(surprise[within])
+        reward, known = torch.zeros_like(batch.reward), torch.zeros_like(batch.is_first)
+        reward[:, 1:], known[:, 1:] = icm.scale(surprise.detach()), within
+        batch = replace(batch, reward=reward, reward_known=known)
+        return super()._update_world_model(batch, metrics, generator, learn_reward)
+
+
+class Plan2Explore(Explorer):
+    """The reward of a step is how much an ensemble disagrees on where it leads.
+
+    It is paid on arriving, as the world model's rewards are: in imagination at the states 1 .. H-1,
+    and at the replayed state 0 for the real step that led there, so that the critic's value means
+    the same everywhere. Nothing led to the first state of a replayed window, which is paid 0.
+    """
+
+    saved_as = "Plan2Explore"
+    curiosity: Ensemble
+    arrival: Tensor  # (B*T,), of the replayed states that the next dream starts from
+
+    def _make_curiosity(self) -> Ensemble:
+        outputs = self.policy.world_model.encoder.embed_dim
+        return Ensemble(self.policy.size, self.max_action_dim, outputs)
+
+    def _update_world_model(
+        self,
+        batch: Batch,
+        metrics: dict[str, list[Tensor]],
+        generator: Generator,
+        learn_reward: bool = False,
+    ) -> Latent:
+        post = super()._update_world_model(batch, metrics, generator)  # never the task's reward
+        ensemble, within = self.curiosity, ~batch.is_first[:, 1:]
+        with self._autocast():
+            with torch.no_grad():
+                embed = self.policy.world_model.encoder(batch.image[:, 1:])
+            prediction = ensemble(post.feat[:, :-1], batch.action[:, 1:])
+            loss = ensemble_loss(prediction, embed, within)
+        self._descend(self.curiosity_optimizer, loss, "curiosity")
+        surprise = disagreement(prediction.detach())
+        ensemble.scale.see(surprise[within])
+        metrics["explore/surprise"].append(surprise[within].mean())
+        paid = ensemble.scale(surprise) * within
+        self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
+        return post
+
+    def _imagined_reward(self, dream: Dream) -> Tensor:
+        ensemble, feat = self.curiosity, dream.states.feat
+        with frozen(ensemble):
+            surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
+        assert len(self.arrival) == len(surprise), (self.arrival.shape, surprise.shape)
+        return torch.cat([self.arrival[:, None], surprise], 1)
+
+
+EXPLORERS: dict[str, type[Explorer]] = {"icm": ICMExplorer, "plan2explore": Plan2Explore}

@@ -1,0 +1,1 @@
+"""Trajectories, datasets, replay, retrieval, and importers of other formats."""

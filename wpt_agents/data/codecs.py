@@ -1,0 +1,63 @@
+"""How the images of a block are kept: losslessly (zstd, raw), or as JPEG for noisy cameras."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+import zstandard
+
+from wpt_agents.files.names import unknown_name
+
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How to keep (n, S, S, 3) uint8 images and the bytes of a vector behind them.
+
+    :param encode: images and vector -> what is stored
+    :param decode: what is stored and the vector's bytes, in number -> the images' bytes, then the
+        vector's
+    """
+
+    encode: Callable[[np.ndarray, bytes], bytes]
+    decode: Callable[[memoryview, int], bytes | memoryview]
+    lossless: bool = True
+
+
+def _to_jpeg(images: np.ndarray, vector: bytes) -> bytes:
+    """One tall picture of all images: a header each would take a third more."""
+    from PIL import Image
+
+    stream = BytesIO()
+    tall = Image.fromarray(np.ascontiguousarray(images).reshape(-1, images.shape[2], 3))
+    tall.save(stream, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return stream.getvalue() + vector
+
+
+def _from_jpeg(stored: memoryview, size: int) -> bytes:
+    from PIL import Image
+
+    end = len(stored) - size
+    return np.asarray(Image.open(BytesIO(stored[:end]))).tobytes() + stored[end:]
+
+
+CODECS = {
+    "jpeg": Codec(_to_jpeg, _from_jpeg, lossless=False),
+    "raw": Codec(lambda images, vector: images.tobytes() + vector, lambda stored, size: stored),
+    "zstd": Codec(
+        lambda images, vector: zstandard.ZstdCompressor(3).compress(images.tobytes() + vector),
+        lambda stored, size: zstandard.ZstdDecompressor().decompress(stored),
+    ),
+}
+
+
+def find_codec(name: str) -> Codec:
+    """The codec of this name.
+
+    :raises ValueError: there is none
+    """
+    if name not in CODECS:
+        raise unknown_name("codec", name, CODECS)
+    return CODECS[name]

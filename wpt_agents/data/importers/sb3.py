@@ -1,0 +1,113 @@
+"""Replay buffers of Stable-Baselines3: a ring of transitions for each of several environments.
+
+Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it rescaled. With
+`optimize_memory_usage` the observation after an episode's last action is overwritten, so that
+action is left out, and no terminal state is seen; nor is it seen where `learn` was called again and
+left an episode for a new one, which then is taken for its continuation.
+"""
+
+import os
+import pickle
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl
+
+from wpt_agents.data.importers.episodes import Episodes, warn_left_out
+from wpt_agents.data.trajectory import Trajectory
+
+
+class SB3Episodes(Episodes):
+    """A replay buffer's episodes, environment by environment, oldest first.
+
+    :param buffer: in memory, or a file of `model.save_replay_buffer`
+    :param image_key: where the images are, if observations are dictionaries
+    :param trust: load a file; SB3's are pickles, which run whatever code is in them
+    """
+
+    def __init__(
+        self,
+        buffer: ReplayBuffer | str | os.PathLike[str],
+        image_key: str | None = None,
+        trust: bool = False,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        if isinstance(buffer, str | os.PathLike):
+            buffer = _load(buffer, trust)
+        if not isinstance(buffer, ReplayBuffer):
+            raise ValueError(f"Expected a ReplayBuffer of SB3, got {type(buffer).__name__}")
+        if not isinstance(buffer.action_space, spaces.Box):
+            raise ValueError(f"The buffer's actions are {buffer.action_space}; they must be a Box")
+        self._buffer, self._key = buffer, image_key
+        self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
+        first = buffer.pos if buffer.full else 0
+        self._rows = (first + np.arange(buffer.size())) % buffer.buffer_size
+        if self._overwritten and buffer.full:
+            self._rows = self._rows[1:]  # the oldest holds the newest's next observation
+        self._bounds = [b for env in range(buffer.n_envs) for b in self._find_bounds(env)]
+        if not self._bounds:
+            raise ValueError("The replay buffer holds no episode")
+
+    def _find_bounds(self, env: int) -> list[tuple[int, int, int]]:
+        """Environment, first row in order of age, and one past the last, for each episode."""
+        ends = np.flatnonzero(self._buffer.dones[self._rows, env]) + 1
+        cuts = [0], ends, self._find_resets(env), [len(self._rows)]
+        edges = np.unique(np.concatenate(cuts).astype(int)).tolist()
+        shortest = 2 if self._overwritten else 1
+        bounds = [(env, a, b) for a, b in pairwise(edges) if b - a >= shortest]
+        warn_left_out(len(edges) - 1 - len(bounds), f"SB3 replay buffer, environment {env}")
+        return bounds
+
+    def _find_resets(self, env: int) -> list[int]:
+        """Where an observation is not what the step before led to: `learn` has begun anew."""
+        if self._overwritten:
+            return []
+        seen = self._images(self._buffer.observations)
+        led_to = self._images(self._buffer.next_observations)
+        steps = enumerate(pairwise(self._rows), start=1)
+        return [i for i, (a, b) in steps if not np.array_equal(led_to[a, env], seen[b, env])]
+
+    def __len__(self) -> int:
+        return len(self._bounds)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        env, start, stop = self._bounds[i]
+        rows, buffer = self._rows[start:stop], self._buffer
+        image = self._images(buffer.observations)[rows, env]
+        terminated = False
+        if self._overwritten:
+            rows = rows[:-1]
+        else:
+            last = self._images(buffer.next_observations)[rows[-1:], env]
+            image = np.concatenate([image, last])
+            over = buffer.dones[rows[-1], env] and not buffer.timeouts[rows[-1], env]
+            terminated = bool(over)
+        source = f"SB3 replay buffer, environment {env}, steps {start} to {stop - 1}"
+        action, reward = buffer.actions[rows, env], buffer.rewards[rows, env]
+        return self._trajectory(image, action, reward, source, terminated=terminated)
+
+    def _images(self, observations: Any) -> np.ndarray:
+        if not isinstance(observations, dict):
+            return observations
+        if self._key not in observations:
+            raise ValueError(
+                f"The replay buffer's observations are {', '.join(observations)}; give image_key"
+            )
+        return observations[self._key]
+
+
+def _load(path: str | os.PathLike[str], trust: bool) -> ReplayBuffer:
+    if not trust:
+        raise ValueError(
+            f"{path} is a pickle, as SB3 saves replay buffers, and loading it runs whatever code "
+            "is in it; if you trust it, say so with trust=True (--trust)"
+        )
+    try:
+        with open(path, "rb") as file:
+            return load_from_pkl(file)
+    except (OSError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path} cannot be read as a replay buffer of SB3: {error}") from error

@@ -1,0 +1,175 @@
+"""What a dataset's folder says of itself: what was fixed, which trajectories, which are damaged.
+
+::
+
+    meta.json      kind, version, image size, codec; written once
+    index.jsonl    a line a trajectory: CRC-32, then JSON; one exists once its line does
+    damaged.json   where the trajectories stand that `validate` has set aside, if there are any
+
+Nothing but appending ever happens to the index. Deleting damaged.json brings back what it names.
+"""
+
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from wpt_agents.files.archive import replacing
+
+KIND, VERSION = "wpt_agents.TrajectoryDataset", 1
+
+Place = tuple[int, int]  # shard and offset, by which a trajectory is known for good
+
+
+@dataclass(frozen=True)
+class Meta:
+    """What is fixed when a dataset is made."""
+
+    image_size: int
+    codec: str
+
+
+@dataclass(slots=True)
+class Entry:
+    """A trajectory's line in the index.
+
+    :param blocks: the blocks' sizes in bytes, in words: parsing 60,000 lists would take a second
+    :param checksum: CRC-32 of the blocks' own; None in datasets written before it was there
+    """
+
+    shard: int
+    at: int
+    blocks: str
+    length: int
+    action_dim: int
+    reward: bool = False
+    terminated: bool = False
+    embodiment: str | None = None
+    task: str | None = None
+    source: str | None = None
+    checksum: int | None = None
+
+    @property
+    def place(self) -> Place:
+        """Where the trajectory begins."""
+        return self.shard, self.at
+
+    @property
+    def sizes(self) -> list[int]:
+        """The blocks' sizes in bytes."""
+        return [int(size) for size in self.blocks.split()]
+
+    def line(self) -> bytes:
+        """The entry as the index holds it."""
+        known = {k: v for k, v in asdict(self).items() if v is not None and v is not False}
+        record = json.dumps(known, separators=(",", ":")).encode()
+        return b"%08x %s\n" % (zlib.crc32(record), record)
+
+
+def create_folder(path: Path, meta: Meta) -> None:
+    """Makes an empty dataset.
+
+    :raises ValueError: no image size, or a folder with something in it
+    """
+    if not 0 < meta.image_size:
+        raise ValueError(f"image_size must be positive, got {meta.image_size}")
+    path.mkdir(parents=True, exist_ok=True)
+    if not all(_left_by_create(file) for file in path.iterdir()):
+        raise ValueError(
+            f"{path} is not empty; open a dataset that is there with TrajectoryDataset.open, "
+            "or create one in another folder"
+        )
+    (path / "index.jsonl").touch()
+    with replacing(path / "meta.json") as temporary:
+        temporary.write_text(json.dumps({"kind": KIND, "version": VERSION, **asdict(meta)}))
+
+
+def _left_by_create(file: Path) -> bool:
+    """Whether the file is all that a `create_folder` killed halfway can have left."""
+    empty = file.name == "index.jsonl" and file.stat().st_size == 0
+    return empty or file.name.startswith(".meta.json.tmp-")
+
+
+def read_meta(path: Path) -> Meta:
+    """The dataset's fixed properties.
+
+    :raises ValueError: no dataset there, or one of a newer version
+    """
+    try:
+        meta = json.loads((path / "meta.json").read_text())
+    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError) as error:
+        state = f"damaged ({error})" if isinstance(error, json.JSONDecodeError) else "missing"
+        what = f"is not a dataset: meta.json is {state}" if path.exists() else "does not exist"
+        raise ValueError(
+            f"{path} {what}. A dataset is a folder made by TrajectoryDataset.create, or by "
+            "`python -m wpt_agents.zoo collect` or `import`"
+        ) from None
+    if not isinstance(meta, dict) or meta.get("kind") != KIND:
+        raise ValueError(f"{path} is not a dataset: meta.json does not say {KIND!r}")
+    if meta["version"] > VERSION:
+        raise ValueError(
+            f"{path} is a dataset of version {meta['version']}, this program reads up to "
+            f"{VERSION}; upgrade wpt-agents"
+        )
+    return Meta(meta["image_size"], meta["codec"])
+
+
+def read_index(path: Path) -> tuple[list[Entry], int]:
+    """All trajectories whose line is complete, and where the last complete line ends.
+
+    :raises ValueError: no index, a complete line that does not match its checksum, or lines that
+        are repeated or out of order
+    """
+    if not (path / "index.jsonl").exists():
+        raise ValueError(f"{path} has lost its index.jsonl; restore the file")
+    data = (path / "index.jsonl").read_bytes()
+    end = data.rfind(b"\n") + 1
+    lines = data[:end].split(b"\n")[:-1]
+    for i, line in enumerate(lines):
+        if line[:8] != b"%08x" % zlib.crc32(line[9:]):
+            raise ValueError(
+                f"{path / 'index.jsonl'} is damaged in line {i + 1} (trajectory {i}); "
+                "restore the file, or delete that line to go on without the trajectory"
+            )
+    records = json.loads(b"[" + b",".join(line[9:] for line in lines) + b"]")
+    entries = [Entry(**record) for record in records]
+    for i, (before, after) in enumerate(pairwise(entries), 1):
+        if after.place <= before.place:  # each trajectory is written behind the one before
+            raise ValueError(
+                f"{path / 'index.jsonl'} is damaged: line {i + 1} is a repetition or out of "
+                "order; restore the file, or delete repeated lines and restore the order"
+            )
+    return entries, end
+
+
+def read_damaged(path: Path) -> dict[Place, str]:
+    """Where the trajectories stand that were set aside, and why.
+
+    :raises ValueError: the list itself is damaged
+    """
+    try:
+        found = json.loads((path / "damaged.json").read_text())
+        return {(item["shard"], item["at"]): item["reason"] for item in found}
+    except FileNotFoundError:
+        return {}
+    except (json.JSONDecodeError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{path / 'damaged.json'} is damaged ({error!r}); delete it and let "
+            "validate(set_aside=True) write it anew"
+        ) from error
+
+
+def add_damaged(path: Path, places: Mapping[Place, str]) -> None:
+    """Sets trajectories aside: whoever opens the folder from now on does not see them."""
+    known = {**read_damaged(path), **places}
+    items = [{"shard": k[0], "at": k[1], "reason": known[k]} for k in sorted(known)]
+    with replacing(path / "damaged.json") as temporary:
+        temporary.write_text(json.dumps(items, indent=1))
+
+
+def undamaged(path: Path, entries: Sequence[Entry]) -> list[Entry]:
+    """The entries that were not set aside."""
+    damaged = read_damaged(path)
+    return [entry for entry in entries if entry.place not in damaged]

@@ -1,0 +1,130 @@
+"""D_on and D_retrieval: whole episodes in memory, and `mix`, experience rehearsal's batch of both.
+
+Example::
+
+    replay = ReplayBuffer()
+    replay.add(trajectory)
+    batch = replay.sample(16, 64, action_width=12, rng=np.random.default_rng(0))
+"""
+
+import os
+
+import numpy as np
+
+from wpt_agents.data.trajectory import Batch, Trajectory
+from wpt_agents.data.windows import Piece, Row, Windows, make_batch
+from wpt_agents.files.archive import load_arrays, save_arrays
+
+ARRAYS = ("image", "action", "reward")
+LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
+
+
+class ReplayBuffer:
+    """Whole episodes in memory; as many as there is memory for.
+
+    :ivar trajectories: what was added, in order; add with `add` only
+    """
+
+    def __init__(self) -> None:
+        self.trajectories: list[Trajectory] = []
+        self._transitions = 0
+        self._windows: Windows | None = None
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Appends one episode, which is kept as it is, not copied.
+
+        :raises ValueError: images of another size than those already here
+        """
+        size = trajectory.image.shape[1:]
+        if self.trajectories and size != self.trajectories[0].image.shape[1:]:
+            raise ValueError(
+                f"The replay buffer holds images of {self.trajectories[0].image.shape[1:]}, "
+                f"got {size}; resize them"
+            )
+        self.trajectories.append(trajectory)
+        self._transitions += len(trajectory)
+        self._windows = None
+
+    def __len__(self) -> int:
+        """The number of transitions (actions), not of episodes."""
+        return self._transitions
+
+    def sample(
+        self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
+    ) -> Batch:
+        """Windows drawn by the rule of `wpt_agents.data.windows`.
+
+        :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
+        """
+        rows = self.draw(batch_size, length, rng)
+        return _batch_of(self.trajectories, rows, action_width)
+
+    def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
+        """Which pieces `sample` would copy."""
+        if not self.trajectories:
+            raise ValueError("The replay buffer is empty; add a trajectory before sampling")
+        if self._windows is None:
+            self._windows = Windows(np.array([len(t) for t in self.trajectories]))
+        return self._windows.draw(batch_size, length, rng)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes one file (arrays and JSON, no pickle), whole or not at all."""
+        episodes = [{k: getattr(t, k) for k in LABELS} for t in self.trajectories]
+        arrays = {
+            f"{i}/{name}": getattr(trajectory, name)
+            for i, trajectory in enumerate(self.trajectories)
+            for name in ARRAYS
+            if getattr(trajectory, name) is not None
+        }
+        save_arrays(path, "ReplayBuffer", {"episodes": episodes}, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "ReplayBuffer":
+        """Reads what `save` wrote.
+
+        :raises ValueError: a file that is cut short, damaged, or not a replay buffer
+        """
+        about, arrays = load_arrays(path, "ReplayBuffer")
+        replay = cls()
+        for i, labels in enumerate(about["episodes"]):
+            streams = {n: arrays[f"{i}/{n}"] for n in ARRAYS if f"{i}/{n}" in arrays}
+            replay.add(Trajectory(**(labels | streams)))
+        return replay
+
+
+def mix(
+    online: ReplayBuffer,
+    retrieved: ReplayBuffer | None,
+    ratio: float,
+    batch_size: int,
+    length: int,
+    action_width: int,
+    rng: np.random.Generator,
+) -> Batch:
+    """Experience rehearsal: a batch of `online`, then `batch_size * ratio` rows of `retrieved`.
+
+    The rewards of `retrieved` are of other tasks or of none, so they are hidden.
+    """
+    if not 0 <= ratio <= 1:
+        raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")
+    others = round(batch_size * ratio) if retrieved else 0
+    trajectories, rows = online.trajectories, []
+    if others < batch_size:
+        rows = online.draw(batch_size - others, length, rng)
+    if retrieved and others:
+        behind = len(trajectories)
+        trajectories = trajectories + retrieved.trajectories
+        drawn = retrieved.draw(others, length, rng)
+        rows += [[(behind + i, start, stop) for i, start, stop in row] for row in drawn]
+    batch = _batch_of(trajectories, rows, action_width)
+    batch.reward[batch_size - others :] = 0
+    batch.reward_known[batch_size - others :] = False
+    return batch
+
+
+def _batch_of(trajectories: list[Trajectory], rows: list[Row], width: int) -> Batch:
+    def read(piece: Piece) -> tuple[Trajectory, int, int]:
+        i, start, stop = piece
+        return trajectories[i], start, stop
+
+    return make_batch(rows, read, trajectories[0].image.shape[1:], width)

@@ -1,0 +1,200 @@
+"""Experience retrieval, Eq. (5): the trajectories that begin most like the task does.
+
+Example::
+
+    retriever = Retriever.build(dataset, embed, encoder_id)
+    indices, distances = retriever.search(embed(obs[None])[0], k=500, embodiment="walker")
+    retrieved = dataset.subset(indices)
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch  # noqa: F401  # before faiss: the other way round crashes on some builds
+
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.files.archive import load_arrays, save_arrays
+
+CHUNK = 4096
+
+
+class Retriever:
+    """The features e(o_0) of every trajectory's first image, searched exactly.
+
+    :param features: (N, E) float32
+    :param action_dims: (N,) int
+    :param embodiments: N names, None where unknown
+    :param encoder_id: which encoder made the features, e.g. a hash of its weights
+    :param dataset_id: of which trajectories, e.g. the dataset's fingerprint
+    """
+
+    def __init__(
+        self,
+        features: np.ndarray,
+        action_dims: np.ndarray,
+        embodiments: Sequence[str | None],
+        encoder_id: str,
+        dataset_id: str = "",
+    ) -> None:
+        assert len(features) == len(action_dims) == len(embodiments), len(features)
+        if not np.isfinite(features).all():
+            raise ValueError("The encoder's features hold NaN or infinity; train it again")
+        self.features = np.ascontiguousarray(features, np.float32)
+        self.action_dims = np.asarray(action_dims)
+        self.embodiments = list(embodiments)
+        self.encoder_id, self.dataset_id = encoder_id, dataset_id
+
+    @classmethod
+    def build(
+        cls,
+        dataset: TrajectoryDataset,
+        embed: Callable[[np.ndarray], np.ndarray],
+        encoder_id: str,
+        progress_bar: bool = False,
+    ) -> "Retriever":
+        """Embeds the first image of every trajectory.
+
+        :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
+        """
+        from tqdm.auto import tqdm
+
+        features, at = np.zeros((len(dataset), 0), np.float32), 0
+        with tqdm(total=len(dataset), desc="index", disable=not progress_bar) as bar:
+            for image in dataset.first_observations():
+                found = np.asarray(embed(image), np.float32)
+                assert found.ndim == 2 and len(found) == len(image), (found.shape, image.shape)
+                if at == 0:
+                    features = np.empty((len(dataset), found.shape[1]), np.float32)
+                features[at : at + len(image)] = found
+                at += len(image)
+                bar.update(len(image))
+        labels = dataset.action_dims, dataset.embodiments
+        return cls(features, *labels, encoder_id, dataset.fingerprint)
+
+    @classmethod
+    def beside(
+        cls,
+        dataset: TrajectoryDataset,
+        embed: Callable[[np.ndarray], np.ndarray],
+        encoder_id: str,
+        progress_bar: bool = False,
+    ) -> "Retriever":
+        """The index that stands beside the dataset; built and saved if missing or out of date.
+
+        A subset's is built each time, since the folder's is of the whole dataset.
+        """
+        path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
+        whole = not dataset.is_subset
+        if whole and path.exists():
+            retriever = cls.load(path, encoder_id)
+            if retriever.dataset_id == dataset.fingerprint:
+                return retriever
+        retriever = cls.build(dataset, embed, encoder_id, progress_bar)
+        try:
+            if whole:
+                retriever.save(path)
+        except OSError as error:
+            warnings.warn(f"The index is kept in memory only: {error}", stacklevel=2)
+        return retriever
+
+    def __len__(self) -> int:
+        """The number of trajectories."""
+        return len(self.features)
+
+    def search(
+        self,
+        embed: np.ndarray,
+        k: int,
+        embodiment: str | None = None,
+        action_dim: int | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Eq. (5): D = ||e(o_on) - e(o_off)||_2, the `k` nearest, each trajectory once.
+
+        :param embed: (E,), the features of the task's first observation
+        :param embodiment: only trajectories of this name, or of none
+        :param action_dim: only trajectories of this action width
+        :return: indices (k',) and distances (k',), nearest first; k' < k if there are no more
+        """
+        if embed.shape != self.features.shape[1:]:
+            raise ValueError(
+                f"The query has shape {embed.shape}, the index holds features of "
+                f"{self.features.shape[1:]}; embed one observation with the index's encoder"
+            )
+        candidates = self._candidates(embodiment, action_dim)
+        if len(candidates) == 0 or k < 1:
+            return np.zeros(0, np.int64), np.zeros(0, np.float32)
+        import faiss
+
+        query, found = np.ascontiguousarray(embed[None], np.float32), []
+        for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
+            chunk = candidates[at : at + CHUNK]
+            squared, near = faiss.knn(query, self.features[chunk], min(k, len(chunk)))
+            found.append((chunk[near[0]], squared[0]))
+        indices, squared = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((indices, squared))[:k]  # equally near: in the dataset's order
+        return indices[order], np.sqrt(squared[order])
+
+    def draw(
+        self,
+        k: int,
+        rng: np.random.Generator,
+        embodiment: str | None = None,
+        action_dim: int | None = None,
+    ) -> np.ndarray:
+        """What `search` chooses from, chosen blindly: `k` indices, each trajectory once."""
+        candidates = self._candidates(embodiment, action_dim)
+        return rng.permutation(candidates)[:k]
+
+    def own_share(self, k: int = 10, queries: int = 100) -> float | None:
+        """How well the features tell robots apart, without their names or widths to help.
+
+        :param queries: named trajectories to ask for, evenly spread, all if there are fewer
+        :return: the share of their `k` nearest named others that are of the same name; None where
+            fewer than two robots are named
+        """
+        named = [i for i, name in enumerate(self.embodiments) if name is not None]
+        names = np.array(self.embodiments)[named]
+        if len(set(names)) < 2:
+            return None
+        others = Retriever(self.features[named], self.action_dims[named], [None] * len(named), "")
+        same = []
+        for i in np.unique(np.linspace(0, len(named) - 1, queries).round().astype(int)):
+            near = others.search(others.features[i], k + 1)[0]
+            same += (names[near[near != i][:k]] == names[i]).tolist()
+        return float(np.mean(same))
+
+    def _candidates(self, embodiment: str | None, action_dim: int | None) -> np.ndarray:
+        wanted = np.ones(len(self), bool)
+        if embodiment is not None:
+            wanted &= np.array([e is None or e == embodiment for e in self.embodiments], bool)
+        if action_dim is not None:
+            wanted &= self.action_dims == action_dim
+        return np.flatnonzero(wanted)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes one file, whole or not at all."""
+        about = {
+            "encoder_id": self.encoder_id,
+            "dataset_id": self.dataset_id,
+            "embodiments": self.embodiments,
+        }
+        arrays = {"features": self.features, "action_dims": self.action_dims}
+        save_arrays(path, "Retriever", about, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], encoder_id: str) -> "Retriever":
+        """Reads what `save` wrote.
+
+        :raises ValueError: an index of another encoder, or a damaged file
+        """
+        about, arrays = load_arrays(path, "Retriever")
+        if about["encoder_id"] != encoder_id:
+            raise ValueError(
+                f"{path} was built with the encoder {about['encoder_id']}, this one is "
+                f"{encoder_id}; delete the file and build the index again"
+            )
+        labels = arrays["action_dims"], about["embodiments"]
+        return cls(arrays["features"], *labels, encoder_id, about.get("dataset_id", ""))

@@ -1,0 +1,212 @@
+"""The folder a dataset is kept in: written trajectory by trajectory, read block by block.
+
+::
+
+    index.jsonl       see `wpt_agents.data.index`
+    shard-00000.bin   blocks of 16 steps, each compressed by itself and followed by its CRC-32
+
+A block holds the images of 16 steps, then the actions taken at them, then their rewards. A line is
+appended to the index after its blocks are on the disk, so a writer killed at any moment leaves at
+most bytes that no line speaks of, and the next writer removes them. A writer excludes others;
+readers need no lock.
+"""
+
+import os
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from io import FileIO
+from pathlib import Path
+
+import numpy as np
+
+from wpt_agents.data.codecs import find_codec
+from wpt_agents.data.index import Entry, Meta, read_index, undamaged
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.archive import sync_folder
+
+BLOCK = 16  # steps; longer compresses little better and makes a window's edges dearer
+SHARD_BYTES = 256 * 2**20
+
+
+def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[memoryview]:
+    """The blocks `first` to `last`, `last` included, as they are stored, CRC-32 and all.
+
+    :raises OSError: a block that cannot be read or does not match its checksum
+    """
+    sizes = entry.sizes
+    name = f"shard-{entry.shard:05d}.bin"
+    with FileIO(path / name) as file:
+        file.seek(entry.at + sum(sizes[:first]))
+        data = memoryview(file.read(sum(sizes[first : last + 1])))
+    at, checksum = 0, 0
+    for block in range(first, last + 1):
+        stored = data[at : at + sizes[block]]
+        at += sizes[block]
+        if len(stored) < sizes[block] or zlib.crc32(stored[:-4]) != int.from_bytes(stored[-4:]):
+            raise OSError(f"block {block} of {name} is cut short or does not match its checksum")
+        checksum = zlib.crc32(stored[-4:], checksum)
+        yield stored
+    all_read = first == 0 and last + 1 == len(sizes)
+    if all_read and entry.checksum is not None and checksum != entry.checksum:
+        raise OSError(f"{name} holds another trajectory than the index names there")
+
+
+def read_steps(
+    path: Path, meta: Meta, entry: Entry, first: int, last: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """The images, actions and rewards of the blocks `first` to `last`, `last` included.
+
+    :raises OSError: a block that cannot be read or does not match its checksum
+    """
+    parts = [
+        _decode(stored[:-4], meta, entry, first + i)
+        for i, stored in enumerate(read_blocks(path, entry, first, last))
+    ]
+    image, action, reward = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return image, action, reward if entry.reward else None
+
+
+def _encode(trajectory: Trajectory, meta: Meta) -> Iterator[bytes]:
+    for at in range(0, len(trajectory.image), BLOCK):
+        steps = slice(at, at + BLOCK)
+        vector = trajectory.action[steps, : trajectory.action_dim].tobytes()
+        if trajectory.reward is not None:
+            vector += trajectory.reward[steps].tobytes()
+        block = find_codec(meta.codec).encode(trajectory.image[steps], vector)
+        yield block + zlib.crc32(block).to_bytes(4)
+
+
+def _decode(
+    block: memoryview, meta: Meta, entry: Entry, number: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    images = min(BLOCK, entry.length + 1 - number * BLOCK)
+    actions = min(BLOCK, entry.length - number * BLOCK)
+    size, wide = meta.image_size, entry.action_dim
+    behind = 4 * actions * (wide + entry.reward)
+    data = find_codec(meta.codec).decode(block, behind)
+    if len(data) != images * size * size * 3 + behind:
+        raise OSError(f"block {number} does not hold {images} images of {size} x {size} pixels")
+    image = np.frombuffer(data, np.uint8, images * size * size * 3)
+    vector = np.frombuffer(data, np.float32, offset=image.nbytes)
+    return (
+        image.reshape(images, size, size, 3),
+        vector[: actions * wide].reshape(actions, wide),
+        vector[actions * wide :],
+    )
+
+
+class Writer:
+    """Appends trajectories to a folder; one at a time has the right to.
+
+    :ivar entries: the trajectories that were there when the writing began
+    :raises ValueError: another writer is at work, or a damaged index
+    """
+
+    def __init__(self, path: Path, meta: Meta) -> None:
+        self._path, self._meta = path, meta
+        self._index = FileIO(path / "index.jsonl", "rb+")
+        try:
+            _lock(self._index.fileno())
+            entries, end = read_index(path)
+            self.entries = undamaged(path, entries)
+            self._index.truncate(end)
+            self._index.seek(end)
+            self._number, self._end = 0, 0
+            if entries:
+                self._number, self._end = entries[-1].shard, entries[-1].at + sum(entries[-1].sizes)
+            self._shard = self._open_shard(self._number, self._end)
+        except BlockingIOError as error:
+            self._index.close()
+            raise ValueError(f"{path} is being written to by someone else; wait for it") from error
+        except BaseException:
+            self._index.close()
+            raise
+
+    def append(self, trajectory: Trajectory) -> Entry:
+        """Writes the blocks, then the line; what fails halfway leaves the dataset as it was."""
+        labels = Entry(
+            shard=0,
+            at=0,
+            blocks="",
+            length=len(trajectory),
+            action_dim=trajectory.action_dim,
+            reward=trajectory.reward is not None,
+            terminated=trajectory.terminated,
+            embodiment=trajectory.embodiment,
+            task=trajectory.task,
+            source=trajectory.source,
+        )
+        return self._add(_encode(trajectory, self._meta), labels)
+
+    def copy(self, blocks: Iterable[bytes | memoryview], entry: Entry) -> Entry:
+        """Adds a trajectory of another folder of the same Meta, as `read_blocks` gives it."""
+        return self._add(blocks, entry)
+
+    def _add(self, blocks: Iterable[bytes | memoryview], labels: Entry) -> Entry:
+        if self._end >= SHARD_BYTES:
+            shard = self._open_shard(self._number + 1, 0)
+            self._shard.close()
+            self._shard, self._number, self._end = shard, self._number + 1, 0
+        line_at = self._index.tell()
+        try:
+            sizes, checksum = list[int](), 0
+            for block in blocks:
+                sizes.append(_write(self._shard.fileno(), block))
+                checksum = zlib.crc32(block[-4:], checksum)
+            os.fsync(self._shard.fileno())
+            entry = replace(
+                labels,
+                shard=self._number,
+                at=self._end,
+                blocks=" ".join(map(str, sizes)),
+                checksum=checksum,
+            )
+            _write(self._index.fileno(), entry.line())
+        except BaseException:
+            for file, end in ((self._index, line_at), (self._shard, self._end)):
+                file.truncate(end)
+                file.seek(end)
+            raise
+        self._end += sum(sizes)
+        return entry
+
+    def flush(self) -> None:
+        """Makes what was appended survive a power cut."""
+        os.fsync(self._index.fileno())
+
+    def close(self) -> None:
+        """Gives the right to write back."""
+        self.flush()
+        self._shard.close()
+        _unlock(self._index.fileno())
+        self._index.close()
+
+    def _open_shard(self, number: int, end: int) -> FileIO:
+        file = FileIO(self._path / f"shard-{number:05d}.bin", "ab")
+        try:
+            file.truncate(end)
+            sync_folder(self._path)
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+
+def _write(descriptor: int, data: bytes | memoryview) -> int:
+    rest = memoryview(data)
+    while rest:  # a disk that fills up takes a part, then raises
+        rest = rest[os.write(descriptor, rest) :]
+    return len(data)
+
+
+def _lock(descriptor: int) -> None:
+    import fcntl  # the kernel takes the lock back when the writer dies
+
+    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _unlock(descriptor: int) -> None:
+    import fcntl  # closing is not enough where a forked process holds the file open, too
+
+    fcntl.flock(descriptor, fcntl.LOCK_UN)

@@ -1,0 +1,108 @@
+"""Which windows a batch is made of, and the batch made of them; one rule for dataset and replay.
+
+A window is `length` images in a row, and each window of each trajectory is equally likely. A
+trajectory with fewer images counts as one window: it is taken whole and chained, the window goes on
+with further trajectories from their first image, drawn uniformly, with `is_first` True at each
+joint. So no trajectory vanishes because it is short.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from wpt_agents.data.trajectory import Batch, Trajectory, led_to
+
+Piece = tuple[int, int, int]  # trajectory, its first image, one past its last image
+Row = list[Piece]  # the pieces that make one sequence
+
+
+class Windows:
+    """Draws windows from trajectories of known lengths.
+
+    :param lengths: (N,) int, the number of actions of each trajectory (it has one image more)
+    """
+
+    def __init__(self, lengths: np.ndarray) -> None:
+        assert len(lengths) > 0
+        self._images = np.asarray(lengths, np.int64) + 1
+        self._ends = (0, self._images)  # window length, (N,) cumulative counts; one object, so
+        # that threads drawing windows of different lengths do not mix them
+
+    def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
+        """The pieces of `batch_size` windows: of one, or of several if trajectories are short."""
+        known, ends = self._ends
+        if known != length:
+            ends = np.cumsum(np.maximum(self._images - length + 1, 1))
+            self._ends = length, ends
+        draws = rng.integers(ends[-1], size=batch_size)
+        chosen = np.searchsorted(ends, draws, side="right")
+        starts = draws - np.concatenate([[0], ends])[chosen]
+        return [
+            self._chain(int(i), int(start), length, rng)
+            for i, start in zip(chosen, starts, strict=True)
+        ]
+
+    def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> Row:
+        pieces = [(i, start, int(min(start + length, self._images[i])))]
+        missing = length - (pieces[0][2] - start)
+        while missing > 0:
+            i = int(rng.integers(len(self._images)))
+            pieces.append((i, 0, int(min(missing, self._images[i]))))
+            missing -= pieces[-1][2]
+        return pieces
+
+
+def make_batch(
+    rows: Sequence[Row],
+    read: Callable[[Piece], tuple[Trajectory, int, int]],
+    image_shape: tuple[int, ...],
+    width: int,
+    each: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
+) -> Batch:
+    """Copies the pieces of each row, one after the other, into a fresh Batch.
+
+    :param read: where a piece is: a trajectory, or a part of one, and the images to take of it
+    :param image_shape: (H, W, 3)
+    :param width: the agent's action width, `max_action_dim`
+    :param each: `map`, or a thread pool's if `read` takes time
+    :raises ValueError: a trajectory with more actions than `width`
+    """
+    length = sum(stop - start for _, start, stop in rows[0])
+    out = _empty(len(rows), length, image_shape, width)
+
+    def fill(b: int) -> None:
+        at = 0
+        for piece in rows[b]:
+            trajectory, start, stop = read(piece)
+            _check_width(trajectory, width)
+            for name, stream in led_to(trajectory, start, stop, width).items():
+                out[name][b, at : at + stop - start] = stream
+            at += stop - start
+
+    for _ in each(fill, range(len(rows))):
+        pass
+    return Batch(**{name: torch.from_numpy(array) for name, array in out.items()})
+
+
+def _empty(
+    size: int, length: int, image_shape: tuple[int, ...], width: int
+) -> dict[str, np.ndarray]:
+    return {
+        "image": np.empty((size, length, *image_shape), np.uint8),
+        "action": np.empty((size, length, width), np.float32),
+        "reward": np.empty((size, length), np.float32),
+        "is_first": np.empty((size, length), bool),
+        "is_terminal": np.empty((size, length), bool),
+        "reward_known": np.empty((size, length), bool),
+    }
+
+
+def _check_width(trajectory: Trajectory, width: int) -> None:
+    if trajectory.action_dim > width:
+        raise ValueError(
+            f"A trajectory of {trajectory.embodiment or 'an unnamed embodiment'} has "
+            f"{trajectory.action_dim} actions, the agent takes {width}; "
+            f"give max_action_dim={trajectory.action_dim} or leave the trajectory out"
+        )

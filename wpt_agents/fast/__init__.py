@@ -1,0 +1,1 @@
+"""Faster versions of functions that `wpt_agents.model` defines."""

@@ -1,0 +1,1 @@
+"""Archives and model files, written atomically and without pickle."""

@@ -1,0 +1,109 @@
+"""The model file: one zip of JSON and safetensors, written whole or not at all, and no pickle."""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+from torch.optim import Optimizer
+
+from wpt_agents.files.archive import replacing
+
+KIND, VERSION = "wpt_agents model", 1
+ABOUT, TENSORS = "about.json", ".safetensors"
+FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, SafetensorError, EOFError, OSError)
+FAULTS += (KeyError, RuntimeError, TypeError, ValueError)  # so fail zipfile and json on nonsense
+
+
+def write_model(
+    path: str | os.PathLike[str] | BufferedIOBase,
+    about: Mapping[str, Any],
+    tensors: Mapping[str, Mapping[str, Tensor]],
+) -> None:
+    """Writes JSON and named groups of tensors to `path`, or to an open binary file."""
+    if isinstance(path, str | os.PathLike):
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            _write(file, about, tensors)
+    else:
+        _write(path, about, tensors)
+
+
+def _write(
+    file: BufferedIOBase, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+) -> None:
+    # ZipInfo has no time of day in it: equal models are equal bytes
+    with zipfile.ZipFile(file, "w") as archive:
+        head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **about}
+        archive.writestr(zipfile.ZipInfo(ABOUT), json.dumps(head, indent=1))
+        for name, group in tensors.items():
+            whole = {key: tensor.detach().cpu().contiguous() for key, tensor in group.items()}
+            archive.writestr(zipfile.ZipInfo(name + TENSORS), save_tensors(whole))
+
+
+def read_model(
+    path: str | os.PathLike[str] | BufferedIOBase,
+) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+    """Reads what `write_model` wrote, every byte checked.
+
+    :raises FileNotFoundError: no such file
+    :raises ValueError: a file that is cut short, damaged, not ours, or of a newer version
+    """
+    if not isinstance(path, str | os.PathLike):
+        return _read(path, "The file")
+    if not Path(path).exists():
+        raise FileNotFoundError(f"There is no model file {path}; pass the path given to save()")
+    with open(path, "rb") as file:
+        return _read(file, str(path))
+
+
+def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            groups = _members(archive)
+            about = json.loads(archive.read(ABOUT))
+            if about["kind"] != KIND:
+                raise ValueError(f"it is a {about['kind']!r}")
+            if about["version"] > VERSION:
+                raise ValueError(f"it is of version {about['version']}: update wpt_agents")
+            if about.get("groups", groups) != groups:
+                raise ValueError(f"it should hold {about['groups']} and holds {groups}")
+            return about, {n: load_tensors(archive.read(n + TENSORS)) for n in groups}
+    except FAULTS as error:
+        raise ValueError(
+            f"{name} is no {KIND} of version {VERSION}, or is damaged ({error}); "
+            "load another copy or an earlier checkpoint"
+        ) from error
+
+
+def _members(archive: zipfile.ZipFile) -> list[str]:
+    """The groups of tensors; nothing else may be there, neither pickled nor compressed."""
+    names = archive.namelist()
+    if ABOUT not in names:
+        raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
+    for info in archive.infolist():
+        known = info.filename == ABOUT or info.filename.endswith(TENSORS)
+        if not known or info.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"it holds {info.filename!r}, which is not of wpt_agents")
+    return [name.removesuffix(TENSORS) for name in names if name != ABOUT]
+
+
+def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
+    """The running averages of an optimiser, by parameter number and name."""
+    state = optimizer.state_dict()["state"]
+    return {f"{i}.{key}": value for i, group in state.items() for key, value in group.items()}
+
+
+def load_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Puts what `optimizer_tensors` gave back; learning rates stay as they are."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})

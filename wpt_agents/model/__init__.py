@@ -1,0 +1,1 @@
+"""The paper's networks, distributions and losses."""

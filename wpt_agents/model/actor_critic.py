@@ -1,0 +1,114 @@
+"""Learning to act in imagination (A.3): Eq. (2) lambda_return, (3) critic_loss, (4) actor_loss."""
+
+import torch
+from torch import Tensor, nn
+
+from wpt_agents.model.distributions import BINS, TruncatedNormal, two_hot_loss, two_hot_mean
+from wpt_agents.model.networks import Head, Size
+
+
+def lambda_return(reward: Tensor, value: Tensor, gamma: float = 0.99, lam: float = 0.95) -> Tensor:
+    """Eq. (2): V_t = r_t + γ [(1 - λ) v_{t+1} + λ V_{t+1}] and V_H = v_H.
+
+    :param reward: (B, H), predicted at the imagined steps 0 .. H-1
+    :param value: (B, H + 1), the critic's means at the steps 0 .. H
+    :return: (B, H), the targets of Eq. (3)
+    """
+    assert value.shape[1] == reward.shape[1] + 1, (value.shape, reward.shape)
+    returns = [value[:, -1]]
+    for t in reversed(range(reward.shape[1])):
+        bootstrap = (1 - lam) * value[:, t + 1] + lam * returns[-1]
+        returns.append(reward[:, t] + gamma * bootstrap)
+    return torch.stack(returns[:0:-1], dim=1)
+
+
+def critic_loss(logits: Tensor, lambda_return: Tensor, gamma: float = 0.99) -> Tensor:
+    """Eq. (3): -ln v(V_t | s_t), averaged, step t weighing γ^t.
+
+    :param logits: (B, H, bins), of detached states
+    :param lambda_return: (B, H); no gradient reaches it
+    """
+    assert logits.shape[:2] == lambda_return.shape, (logits.shape, lambda_return.shape)
+    weight = discounts(lambda_return.shape[1], gamma, like=lambda_return)
+    return (weight * two_hot_loss(logits, lambda_return.detach())).mean()
+
+
+def actor_loss(
+    lambda_return: Tensor,
+    entropy: Tensor,
+    ent_coef: float = 1e-4,
+    gamma: float = 0.99,
+    return_scale: Tensor | float = 1.0,
+) -> Tensor:
+    """Eq. (4): -V_t - η H[a_t | s_t], averaged, step t weighing γ^t.
+
+    V_0 holds the reward of the starting state, which no imagined action caused, so the returns of
+    the steps 1 .. H-1 are what the actions of the steps 0 .. H-2 are judged by.
+
+    :param lambda_return: (B, H), with its gradient through the dynamics
+    :param entropy: (B, H), of the actor at the steps 0 .. H-1
+    :param return_scale: what returns are divided by; 1 in the paper
+    """
+    assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
+    weight = discounts(entropy.shape[1] - 1, gamma, like=entropy)
+    objective = lambda_return[:, 1:] / return_scale + ent_coef * entropy[:, :-1]
+    return -(weight * objective).mean()
+
+
+def discounts(length: int, gamma: float, like: Tensor) -> Tensor:
+    """1, γ, γ², ...: (length,)."""
+    return gamma ** torch.arange(length, device=like.device, dtype=torch.float32)
+
+
+def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -> Tensor:
+    """The width of the returns between two quantiles, DreamerV3's scale for the actor's loss."""
+    quantiles = torch.quantile(
+        lambda_return.detach().flatten(),
+        torch.tensor([low, high], device=lambda_return.device),
+    )
+    return quantiles[1] - quantiles[0]
+
+
+@torch.no_grad()
+def ema_update(target: nn.Module, source: nn.Module, fraction: float = 0.02) -> None:
+    """Moves `target` towards `source` by `fraction`."""
+    torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), fraction)
+
+
+class Actor(Head):
+    """π(a | s): a truncated normal with tanh means and standard deviations from 0.1 to 1.
+
+    :param size: the widths
+    :param action_dim: the padded action width, A
+    """
+
+    def __init__(self, size: Size, action_dim: int, outscale: float = 1.0) -> None:
+        super().__init__(size, 3, 2 * action_dim)
+        with torch.no_grad():
+            for parameter in self.layers[-1].parameters():
+                parameter.mul_(outscale)
+
+    def dist(self, feat: Tensor, mask: Tensor) -> TruncatedNormal:
+        """The action distribution.
+
+        :param feat: (..., D + S*K)
+        :param mask: (A,) bool, True at the embodiment's own entries
+        """
+        return self.truncated(self(feat), mask)
+
+    @staticmethod
+    def truncated(outputs: Tensor, mask: Tensor) -> TruncatedNormal:
+        """The distribution that the network's outputs (..., 2 A) stand for."""
+        mean, std = outputs.float().chunk(2, -1)
+        return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
+
+
+class Critic(Head):
+    """v(V | s): a distribution over returns, symlog two-hot."""
+
+    def __init__(self, size: Size, zero_init: bool = False) -> None:
+        super().__init__(size, 3, BINS, zero_init)
+
+    def value(self, feat: Tensor) -> Tensor:
+        """The mean return: (..., D + S*K) -> (...)."""
+        return two_hot_mean(self(feat))

@@ -1,0 +1,100 @@
+"""The prior actor: a behaviour clone of the retrieved trajectories (A.3, Algorithm 1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Generator, Tensor, nn
+
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.networks import Encoder, Linear, LinearNorm, Size
+
+FRAMES = 3  # what one image does not show, such as velocities, three do
+
+
+def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
+    """-log π_bc(a | o) of a Gaussian of fixed variance, up to constants: the squared error.
+
+    :param prediction: (N, A), the Gaussian's mean
+    :param action: (N, A), taken at the observation
+    :param mask: (A,) bool, True at the embodiment's own entries; the others count nothing
+    """
+    assert prediction.shape == action.shape, (prediction.shape, action.shape)
+    return ((prediction - action).square() * mask).sum() / (mask.sum() * len(action))
+
+
+def draw_pairs(
+    trajectories: Sequence[Trajectory], n: int, action_dim: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draws n of all trajectories' steps: what was seen, and the action that was then taken.
+
+    Before an episode's third image its first one stands for those that are missing, as in acting.
+
+    :return: images (n, F, 64, 64, 3) uint8, oldest first, and actions (n, A), padded with zeros
+    """
+    ends = np.cumsum([len(trajectory) for trajectory in trajectories])
+    draws = rng.integers(ends[-1], size=n)
+    chosen = np.searchsorted(ends, draws, side="right")
+    steps = draws - np.concatenate([[0], ends])[chosen]
+    times = np.maximum(steps[:, None] + np.arange(1 - FRAMES, 1), 0)
+    image = np.stack([trajectories[i].image[t] for i, t in zip(chosen, times, strict=True)])
+    action = np.zeros((n, action_dim), np.float32)
+    for row, i, t in zip(action, chosen, steps, strict=True):
+        taken = trajectories[i].action[t]
+        row[: len(taken)] = taken
+    return torch.from_numpy(image), torch.from_numpy(action)
+
+
+def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:
+    """Moves each stack of frames by up to `pad` pixels, repeating the border.
+
+    :param image: (N, F, H, W, C)
+    """
+    n, _, height, width, _ = image.shape
+    shift = torch.randint(-pad, pad + 1, (n, 2), device=image.device, generator=generator)
+    rows = (torch.arange(height, device=image.device) + shift[:, :1]).clamp(0, height - 1)
+    columns = (torch.arange(width, device=image.device) + shift[:, 1:]).clamp(0, width - 1)
+    which = torch.arange(n, device=image.device)[:, None, None]
+    moved = image.transpose(1, 2).transpose(2, 3)  # (N, H, W, F, C): one index does all frames
+    return moved[which, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2, 4)
+
+
+def recent_frames(image: Tensor, is_first: Tensor) -> Tensor:
+    """What the prior actor sees at each image of a window, from its third one on.
+
+    Where an episode begins inside the window, its first image stands for those that are missing.
+
+    :param image: (B, T, 64, 64, 3)
+    :param is_first: (B, T) bool
+    :return: (B, T - 2, F, 64, 64, 3), oldest first
+    """
+    time = torch.arange(image.shape[1], device=image.device)
+    begun = torch.where(is_first, time, 0).cummax(1).values
+    before = torch.arange(1 - FRAMES, 1, device=image.device)
+    wanted = torch.maximum(time[:, None] + before, begun[..., None])[:, FRAMES - 1 :]
+    return image[torch.arange(len(image), device=image.device)[:, None, None], wanted]
+
+
+class PriorActor(nn.Module):
+    """π_bc(a | o): its own encoder over three stacked frames, then an MLP.
+
+    :param size: the widths; its own are half as deep
+    :param action_dim: the padded action width, A
+    """
+
+    def __init__(self, size: Size, action_dim: int) -> None:
+        super().__init__()
+        self.encoder = Encoder(max(size.depth // 2, 8), 3 * FRAMES)
+        self.layers = nn.Sequential(
+            LinearNorm(self.encoder.embed_dim, size.units),
+            LinearNorm(size.units, size.units),
+            Linear(size.units, action_dim),
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8, oldest first -> (N, A), not clipped."""
+        return self.layers(self.encoder(image.permute(0, 2, 3, 1, 4).flatten(-2)))
+
+    def act(self, image: Tensor, mask: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1], zero in the padding."""
+        return self(image).clamp(-1, 1) * mask

@@ -1,0 +1,335 @@
+"""All networks in one module, and how they act: filter a latent, then the actor decides."""
+
+import hashlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from torch import Generator, Tensor
+
+from wpt_agents.data.images import resized
+from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
+from wpt_agents.fast.acting import FastStep
+from wpt_agents.model.actor_critic import Actor, Critic
+from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.model.distributions import Noise
+from wpt_agents.model.networks import Size, frozen
+from wpt_agents.model.rssm import Latent
+from wpt_agents.model.world_model import WorldModel, world_model_update_loss
+
+IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+State = tuple[np.ndarray, ...]
+
+
+class Dream(NamedTuple):
+    """Imagined trajectories: N starts, H steps."""
+
+    states: Latent  # (N, H + 1, ...)
+    action: Tensor  # (N, H, A)
+    entropy: Tensor  # (N, H), of the actor at the steps 0 .. H-1
+    saturated: Tensor  # scalar, the share of means beyond 0.99
+
+
+def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarray, bool]:
+    """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
+
+    Takes (H, W, 3) and (3, H, W), one or a batch; other sizes are resized.
+
+    :raises ValueError: anything that is no uint8 image
+    """
+    observation = np.asarray(observation)
+    batched = observation.ndim == 4
+    images = observation if batched else observation[None]
+    if images.ndim == 4 and images.shape[-1] != 3 and images.shape[1] == 3:
+        images = images.transpose(0, 2, 3, 1)
+    if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8:
+        raise ValueError(
+            f"An observation must be an image, (H, W, 3) uint8 or a batch of them, got "
+            f"{observation.shape} {observation.dtype}; render the environment to pixels"
+        )
+    if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
+        images = resized(images, IMAGE_SIZE)
+    return np.require(images, requirements=("C", "W")), batched
+
+
+class WPTPolicy(BasePolicy):
+    """World model, actor, critic, target critic and prior actor.
+
+    :param observation_space: kept as the environment has it; images are converted at the border
+    :param action_space: a Box; its width is the embodiment's own, at most `max_action_dim`
+    :param size: the widths of all networks
+    :param max_action_dim: A, the padded action width of the world model
+    :param unimix: share of the uniform in every latent distribution
+    :param zero_init_heads: start reward head and critic at zero
+    :param actor_outscale: factor on the initial weights of the actor's last layer
+    """
+
+    action_space: spaces.Box
+    action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
+    return_scale: Tensor  # scalar, what returns are divided by
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        size: Size,
+        max_action_dim: int,
+        unimix: float = 0.01,
+        zero_init_heads: bool = False,
+        actor_outscale: float = 1.0,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        self.size, self.max_action_dim = size, max_action_dim
+        self.zero_init_heads, self.actor_outscale = zero_init_heads, actor_outscale
+        self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
+        self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
+        self.register_buffer("return_scale", torch.ones(()))
+        self.reset_behavior()
+        self.generator: Generator | None = None  # of collection; `predict` leaves it alone
+        self._fast_step: FastStep | None = None
+        self.set_action_space(action_space)
+
+    def reset_behavior(self) -> None:
+        """Draws all that belongs to a task anew: reward head, actor, critic, prior actor."""
+        size, device = self.size, self.device
+        self.world_model.reset_reward_head()
+        self.world_model.to(device)
+        self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
+        self.critic = Critic(size, self.zero_init_heads).to(device)
+        self.target_critic = Critic(size).to(device).requires_grad_(False)
+        self.target_critic.load_state_dict(self.critic.state_dict())
+        self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
+        self.return_scale.fill_(1)
+
+    def set_action_space(self, action_space: spaces.Box) -> None:
+        """Acts in this space from now on; entries past its width are masked everywhere."""
+        self.action_space = action_space
+        self.action_mask[:] = torch.arange(self.max_action_dim) < action_space.shape[0]
+
+    def initial_state(self, n: int) -> State:
+        """The acting state of n fresh episodes: h (n, D), z (n, S, K), previous action (n, A)."""
+        shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
+        return tuple(np.zeros(s, np.float32) for s in (*shapes, (n, self.max_action_dim)))
+
+    @torch.inference_mode()
+    def act(
+        self,
+        image: np.ndarray,
+        state: State | None,
+        episode_start: np.ndarray | None,
+        deterministic: bool = False,
+        generator: Generator | None = None,
+    ) -> tuple[np.ndarray, State]:
+        """One step of filtering and acting.
+
+        :param image: (n, 64, 64, 3) uint8
+        :param state: from the step before, or None
+        :param episode_start: (n,) bool, where the state is reset
+        :param deterministic: take the likeliest latent and the mean action
+        :param generator: of the draws; torch's own if None
+        :return: action (n, A) in [-1, 1], zero in the padding, and the new state
+        """
+        n = len(image)
+        if state is not None and len(state[0]) != n:
+            raise ValueError(
+                f"The state is of {len(state[0])} environments, the observation of {n}: pass "
+                "state=None where all episodes begin"
+            )
+        *latent, action = (self._tensor(x) for x in state or self.initial_state(n))
+        first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
+        post, outputs = self._stepper()(
+            self._tensor(image),
+            Latent(*latent),
+            action,
+            self._tensor(first),
+            generator,
+            sample=not deterministic,
+        )
+        dist = self.actor.truncated(outputs, self.action_mask)
+        action = dist.mode if deterministic else dist.rsample(generator)
+        state = tuple(x.cpu().numpy() for x in (*post, action))
+        if not np.isfinite(state[-1]).all():
+            raise ValueError("The actor's output is not finite: the weights are damaged")
+        return state[-1], state
+
+    def step(
+        self,
+        image: Tensor,
+        state: Latent,
+        action: Tensor,
+        is_first: Tensor,
+        generator: Generator | None = None,
+        sample: bool = True,
+    ) -> tuple[Latent, Tensor]:
+        """One step of filtering and the actor's outputs; `FastStep` computes the same on a CPU.
+
+        :param image: (N, 64, 64, 3) uint8
+        :param state: of the step before, (N, ...)
+        :param action: (N, A), what led to the image
+        :param is_first: (N,) bool, where state and action are reset
+        :return: the posterior state, and what `Actor.truncated` takes, (N, 2 A)
+        """
+        rssm, embed = self.world_model.rssm, self.world_model.encoder(image)
+        post = rssm.filter_step(state, action, embed, is_first, generator, sample)
+        return post, self.actor(post.feat)
+
+    def _stepper(self) -> Callable[..., tuple[Latent, Tensor]]:
+        """`step`, or the like of it that was made for the present weights."""
+        networks = self.world_model.encoder, self.world_model.rssm, self.actor
+        if not FastStep.takes(*networks):
+            return self.step
+        if self._fast_step is None or not self._fast_step.is_of(*networks):
+            self._fast_step = FastStep(*networks)
+        return self._fast_step
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(array)).to(self.action_mask.device)
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
+        low, high = self.action_space.low, self.action_space.high
+        own = action[:, : len(low)].clip(-1, 1)
+        action = low + 0.5 * (own + 1) * (high - low)
+        return action.clip(low, high).astype(self.action_space.dtype)  # rounding may overstep
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """The action in the environment's own space, and the recurrent state to hand back.
+
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
+            are converted
+        :param state: what the last call returned; None at the start
+        :param episode_start: (n,) bool, where an episode begins; None for nowhere
+        """
+        images, batched = to_images(observation)
+        action, state = self.act(images, state, episode_start, deterministic)
+        action = self.to_env(action)
+        return (action if batched else action[0]), state
+
+    def _predict(  # type: ignore[override]  # images alone, no dictionaries of them
+        self, observation: Tensor, deterministic: bool = False
+    ) -> Tensor:
+        """SB3's stateless form: every observation is taken for an episode's first."""
+        images, _ = to_images(observation.cpu().numpy())
+        return self._tensor(self.to_env(self.act(images, None, None, deterministic)[0]))
+
+    def dream(self, start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
+        """Imagines with the actor in the frozen world model; gradients run through the dynamics.
+
+        :param start: (N, ...), the states to start from
+        """
+        with frozen(self.world_model):
+            return self.imagine(start.detach(), horizon, generator)
+
+    def imagine(self, start: Latent, horizon: int, generator: Noise = None) -> Dream:
+        """The loop of `dream`."""
+        entropies, saturated = [], []
+
+        def policy(state: Latent, _: int) -> Tensor:
+            dist = self.actor.dist(state.feat.detach(), self.action_mask)
+            entropies.append(dist.entropy())
+            saturated.append(((dist.mean.detach().abs() > 0.99) & self.action_mask).float().sum(-1))
+            return dist.rsample(generator)
+
+        states, action = self.world_model.rssm.imagine(start, policy, horizon, generator)
+        share = torch.stack(saturated).mean() / self.action_mask.sum()
+        return Dream(states, action, torch.stack(entropies, 1), share)
+
+    @torch.no_grad()
+    def embed(self, image: np.ndarray) -> np.ndarray:
+        """e(o) of Eq. (5): (n, 64, 64, 3) uint8 -> (n, E) float32."""
+        return self.world_model.encoder(self._tensor(image)).float().cpu().numpy()
+
+    def encoder_id(self) -> str:
+        """A hash of the encoder's weights, by which an index knows whose features it holds."""
+        digest = hashlib.sha256()
+        for tensor in self.world_model.encoder.state_dict().values():
+            digest.update(tensor.cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    @torch.no_grad()
+    def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
+        """What the world model expects to see: `context` reconstructions, then a dream.
+
+        :return: (context + horizon or the trajectory's images, 64, 64, 3) uint8
+        """
+        stop = min(context + horizon, len(trajectory) + 1)
+        batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)])
+        generator = Generator(self.device).manual_seed(0)
+        frames = self.world_model.open_loop(batch.to(self.device), context, generator)
+        return frames[0].cpu().numpy()
+
+    @torch.no_grad()
+    def heldout_errors(self, trajectory: Trajectory, images: int = 256) -> dict[str, float]:
+        """How far the world model is off on an episode with rewards that it has not replayed yet.
+
+        :param images: at most so many, from the episode's start
+        :return: `reconstruction`, the squared error of Eq. (1) summed over an image, and `reward`,
+            the mean absolute error; both averaged over the steps
+        """
+        stop = min(len(trajectory) + 1, images)
+        batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)]).to(self.device)
+        model = self.world_model
+        loss, post = world_model_update_loss(model, batch, Generator(self.device).manual_seed(0))
+        error = (model.reward(post.feat) - batch.reward).abs()[batch.reward_known].mean()
+        return {"reconstruction": loss.reconstruction.item(), "reward": error.item()}
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **super()._get_constructor_parameters(),
+            "size": self.size,
+            "max_action_dim": self.max_action_dim,
+        }
+
+
+class PriorPolicy:
+    """The prior actor by SB3's `predict`; its state is the last three images."""
+
+    def __init__(self, policy: WPTPolicy) -> None:
+        self.policy = policy
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """As `WPTPolicy.predict`; the clone has no noise to leave out."""
+        images, batched = to_images(observation)
+        frames = stack_frames(images, state[0] if state else None, episode_start)
+        action = self.policy.to_env(prior_action(self.policy, frames))
+        return (action if batched else action[0]), (frames,)
+
+
+def stack_frames(
+    image: np.ndarray, frames: np.ndarray | None, episode_start: np.ndarray | None
+) -> np.ndarray:
+    """The last three images of n episodes, the first one repeated where an episode begins.
+
+    :param image: (n, 64, 64, 3), the newest
+    :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
+    :param episode_start: (n,) bool
+    """
+    if frames is None:
+        return np.repeat(image[:, None], FRAMES, 1)
+    moved = np.concatenate([frames[:, 1:], image[:, None]], 1)
+    if episode_start is not None:
+        first = np.asarray(episode_start, bool)
+        moved[first] = image[first, None]
+    return moved
+
+
+@torch.no_grad()
+def prior_action(policy: WPTPolicy, frames: np.ndarray) -> np.ndarray:
+    """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
+    images = torch.from_numpy(frames).to(policy.device)
+    return policy.prior_actor.act(images, policy.action_mask).cpu().numpy()

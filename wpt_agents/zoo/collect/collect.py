@@ -1,0 +1,334 @@
+"""Non-curated data: trajectories of noise, noised policies or curiosity, without rewards.
+
+Example::
+
+    dataset = collect("data", ["wpt/dmc-walker-stand-v0", "wpt/dmc-cartpole-swingup-v0"], 30)
+"""
+
+import json
+import os
+import shutil
+import warnings
+import zlib
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import wpt_envs
+from gymnasium import spaces
+from tqdm.auto import tqdm
+
+from wpt_agents.agents.curious import EXPLORE, EXPLORERS
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.archive import replacing
+from wpt_agents.files.names import unknown_name
+from wpt_agents.training.checks import check_hyperparameters
+from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
+from wpt_agents.zoo.collect.curious import Expedition, explore_each
+from wpt_agents.zoo.collect.policies import SavedPolicy, load_policy, sees_states
+from wpt_agents.zoo.collect.workers import worker_pool
+from wpt_agents.zoo.run.progress import progress
+
+BEHAVIOURS = ("random", "noise", "scripted", "policy", *EXPLORERS)
+SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
+MAX_STEPS = 1000  # where an environment without a time limit is cut
+EPISODES_A_JOB = 4
+
+
+def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
+    """Plays one episode, cut after `max_steps`, and returns it with its rewards."""
+    obs, info = env.reset(seed=seed)
+    images, actions, rewards = [obs], list[np.ndarray](), list[float]()
+    terminated = truncated = False
+    while not (terminated or truncated or len(actions) == max_steps):
+        action = np.asarray(act(obs, info, len(actions)), np.float32)
+        obs, reward, terminated, truncated, info = env.step(action)
+        images.append(obs)
+        actions.append(action)
+        rewards.append(float(reward))
+    return Trajectory(
+        np.stack(images), np.stack(actions), np.array(rewards, np.float32), bool(terminated)
+    )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the episodes of a collection come about, apart from the task.
+
+    :param behaviour: one of `BEHAVIOURS`
+    :param env: keyword arguments of `gymnasium.make`
+    :param rewards: whether to keep the rewards
+    :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
+    :param policy: a saved policy, see `wpt_agents.zoo.collect.policies.load_policy`
+    :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
+    """
+
+    seed: int = 0
+    behaviour: str = "noise"
+    env: Mapping[str, Any] = field(default_factory=dict)
+    rewards: bool = False
+    sigmas: tuple[float, ...] = SIGMAS
+    policy: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def label(self) -> dict[str, Any]:
+        """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
+        always, default = ("seed", "behaviour", "env"), vars(Plan())
+        told = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
+        return json.loads(json.dumps(told))
+
+    def sigma(self, episode: int) -> float:
+        """The noise of an episode."""
+        return self.sigmas[episode % len(self.sigmas)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Consecutive episodes of one task, all that a worker needs to know of them."""
+
+    task: str
+    first: int
+    count: int
+    plan: Plan
+
+
+def play(job: Job) -> list[Trajectory]:
+    """The episodes of a job: a function of the job alone."""
+    with closing(make_env(job.task, job.plan)) as env, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
+        episodes = range(job.first, job.first + job.count)
+        return [_play_episode(env, job, episode) for episode in episodes]
+
+
+def make_env(task: str, plan: Plan) -> gym.Env:
+    """The task with actions in [-1, 1], telling its state to those who need it."""
+    told = plan.behaviour == "scripted" and _has_script(task)
+    told = told or (plan.policy is not None and sees_states(plan.policy))
+    env = gym.make(task, **plan.env, **({"state_in_info": True} if told else {}))
+    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env
+
+
+def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
+    plan, task = job.plan, zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
+    source = np.random.SeedSequence([plan.seed, task, episode])
+    assert env.action_space.shape is not None
+    act, name = _actions(
+        np.random.default_rng(source), job.task, plan, episode, env.action_space.shape[0]
+    )
+    played = record(env, act, int(source.generate_state(1)[0]))
+    reward = played.reward if plan.rewards else None
+    return replace(played, reward=reward, embodiment=_robot(job.task), task=job.task, source=name)
+
+
+def _actions(
+    rng: np.random.Generator, task: str, plan: Plan, episode: int, width: int
+) -> tuple[Act, str]:
+    if plan.behaviour == "policy":
+        assert plan.policy is not None
+        sigma = plan.sigma(episode)
+        name = f"policy {Path(plan.policy).name}, sigma {sigma}"
+        return SavedPolicy(rng, plan.policy, sigma, width), name
+    if plan.behaviour == "random":
+        return random_actions(rng, width, MAX_STEPS)
+    if plan.behaviour == "scripted" and _has_script(task):
+        return scripted_actions(rng, task, plan.sigma(episode))
+    return noise_actions(rng, width, MAX_STEPS)
+
+
+def collect(
+    path: str | os.PathLike[str],
+    tasks: Sequence[str],
+    episodes: int,
+    seed: int = 0,
+    workers: int = 2,
+    behaviour: str = "noise",
+    env: Mapping[str, Any] | None = None,
+    progress_bar: bool = True,
+    *,
+    rewards: bool = False,
+    sigmas: Sequence[float] = SIGMAS,
+    policy: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> TrajectoryDataset:
+    """Plays `episodes` of each task and stores them; what `path` holds already is kept.
+
+    The data are a function of the arguments, `workers` and interruptions apart. Workers are fresh
+    processes: call this from a script under `if __name__ == "__main__":`.
+
+    :param path: a folder; a finished one is returned as it is, half of one is continued
+    :param tasks: ids for `gymnasium.make`
+    :param behaviour: "noise", of random colour and strength; "random", uniform; "scripted",
+        Meta-World's scripts with noise, elsewhere "noise"; "policy", a saved one with noise; "icm"
+        or "plan2explore", a curious agent for each task
+    :param env: keyword arguments of `gymnasium.make`
+    :param rewards: store the rewards, too
+    :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, in turn
+        by episode
+    :param policy: a WPT model file, or one of SB3's as "sac:expert.zip"; takes images, or states
+        where the environment tells them
+    :param settings: keywords of WPT for a curious agent, beside `exploration.EXPLORE`
+    """
+    _check(tasks, episodes, behaviour, policy)
+    check_hyperparameters({**EXPLORE, **(settings or {})})
+    plan = Plan(
+        seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
+    )
+    told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
+    dataset, total = _open(Path(path), told), len(tasks) * episodes
+    if dataset.appended > total:
+        raise ValueError(
+            f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
+            "two processes have collected into it at once; delete it and collect again"
+        )
+    if dataset.appended == total:
+        return dataset
+    label, gather = f"collect {behaviour}", _collect_played
+    if behaviour in EXPLORERS:
+        gather = _collect_curious
+    with dataset:
+        dataset.reserve()  # before what is missing is counted
+        with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
+            gather(dataset, tasks, episodes, plan, workers, bar)
+    return TrajectoryDataset.open(path)
+
+
+def _collect_played(
+    dataset: TrajectoryDataset,
+    tasks: Sequence[str],
+    episodes: int,
+    plan: Plan,
+    workers: int,
+    bar: "tqdm[None]",
+) -> None:
+    jobs = [
+        Job(task, first, min(EPISODES_A_JOB, episodes - first), plan)
+        for at, task in enumerate(tasks)
+        for first in range(_done(dataset, at, episodes), episodes, EPISODES_A_JOB)
+    ]
+    for trajectories in _played(jobs, workers):
+        for trajectory in trajectories:
+            dataset.append(trajectory)
+        dataset.flush()
+        bar.update(len(trajectories))
+
+
+def _collect_curious(
+    dataset: TrajectoryDataset,
+    tasks: Sequence[str],
+    episodes: int,
+    plan: Plan,
+    workers: int,
+    bar: "tqdm[None]",
+) -> None:
+    """Each task's agent plays in a folder beside the data, which is taken in when it is done."""
+    trips = [
+        Expedition(
+            task,
+            episodes,
+            plan.seed,
+            plan.behaviour,
+            dataset.path / f"exploring-{zlib.crc32(task.encode()):08x}",
+            partial(make_env, task, plan),
+            plan.settings,
+            _robot(task),
+            plan.rewards,
+        )
+        for at, task in enumerate(tasks)
+        if _done(dataset, at, episodes) < episodes
+    ]
+    finished = (len(tasks) - len(trips)) * episodes
+
+    def moved(stored: int) -> None:
+        bar.update(finished + stored - bar.n)
+
+    for found in explore_each(trips, workers, moved):
+        dataset.extend(found.subset(range(dataset.appended % episodes, episodes)))
+        dataset.flush()
+    moved(len(trips) * episodes)
+    for folder in dataset.path.glob("exploring-*"):
+        shutil.rmtree(folder)
+
+
+def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
+    """How many episodes of the task number `at` the dataset holds: they come task by task."""
+    return min(max(dataset.appended - at * episodes, 0), episodes)
+
+
+def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | None) -> None:
+    if not tasks or len(set(tasks)) < len(tasks) or episodes < 1:
+        raise ValueError(
+            f"collect wants different tasks and at least 1 episode of each, got {list(tasks)} "
+            f"and {episodes}"
+        )
+    if behaviour not in BEHAVIOURS:
+        raise unknown_name("behaviour", behaviour, BEHAVIOURS)
+    if behaviour == "scripted" and not any(map(_has_script, tasks)):
+        raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
+    if (behaviour == "policy") != (policy is not None):
+        raise ValueError("The behaviour 'policy', and no other, wants policy=FILE (--policy FILE).")
+    if policy is not None:
+        load_policy(policy)  # says what is wrong with it
+
+
+def _robot(task: str) -> str | None:
+    row = wpt_envs.TASKS.get(task)
+    return row.embodiment if row else None
+
+
+def _has_script(task: str) -> bool:
+    row = wpt_envs.TASKS.get(task)
+    return row is not None and row.suite == "metaworld"
+
+
+def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
+    """The dataset to append to: a new one, or the one that the same call began."""
+    label = path / "collect.json"
+    dataset = TrajectoryDataset.open_or_create(path)
+    if not label.exists() and dataset.appended == 0:
+        with replacing(label) as temporary:
+            temporary.write_text(json.dumps(told, indent=1))
+    found = _read_label(label) if label.exists() else {}
+    differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]
+    if differ:
+        raise ValueError(
+            f"{path} holds something else than this collection (different: {', '.join(differ)}); "
+            "give another path, or delete it"
+        )
+    return dataset
+
+
+def _read_label(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(
+            f"{file} is damaged ({error}); restore the file, or give another path"
+        ) from error
+
+
+def _played(jobs: Sequence[Job], workers: int) -> Iterator[list[Trajectory]]:
+    """The results of the jobs in their order, at most two a worker ahead of the reader."""
+    if workers < 2 or len(jobs) < 2:
+        yield from map(play, jobs)
+        return
+    with worker_pool(workers) as pool:
+        ahead: deque[Future[list[Trajectory]]] = deque()
+        try:
+            for job in jobs:
+                ahead.append(pool.submit(play, job))
+                if len(ahead) >= 2 * workers:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,123 @@
+"""Collecting by curiosity: one agent a task, which learns from what it has played so far.
+
+An agent works in a folder of its own, with a dataset and a model file that is written after every
+episode; from the two it goes on as if it had never stopped.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import wait as wait_for
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch
+
+from wpt_agents.agents.curious import EXPLORE, EXPLORERS, Explorer
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.zoo.collect.workers import worker_pool
+
+
+@dataclass(frozen=True)
+class Expedition:
+    """All episodes of one task, all that a worker needs to know of them.
+
+    :param folder: where the agent works
+    :param settings: keywords of WPT beside `EXPLORE`
+    """
+
+    task: str
+    episodes: int
+    seed: int
+    behaviour: str
+    folder: Path
+    make: Callable[[], gym.Env]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    embodiment: str | None = None
+    rewards: bool = False
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in one order, whatever the machine: the data shall depend on the seed alone."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def explore(trip: Expedition) -> Iterator[int]:
+    """Plays what is missing of an expedition; yields each episode's number when it is stored."""
+    trip.folder.mkdir(parents=True, exist_ok=True)
+    store = TrajectoryDataset.open_or_create(trip.folder / "data")
+    if len(store) == trip.episodes:
+        return
+    with _one_thread(), store, closing(trip.make()) as env:
+        model = _explorer(trip, env, store)
+        for trajectory in model.explore(trip.episodes):
+            if len(store) < model.episodes:  # else it was stored before the model was
+                store.append(_labelled(trajectory, trip, model.episodes))
+            model.save(trip.folder / "explorer.zip")
+            yield model.episodes
+
+
+def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explorer:
+    """A new agent, or the one that played what is stored."""
+    kind, file = EXPLORERS[trip.behaviour], trip.folder / "explorer.zip"
+    if not file.exists():
+        assert env.action_space.shape is not None
+        given = {**EXPLORE, "max_action_dim": env.action_space.shape[0], **trip.settings}
+        return kind("WPTPolicy", env, seed=trip.seed, **given)
+    model = kind.load(file, env=env)
+    for trajectory in store.subset(range(model.episodes)):
+        model.replay_buffer.add(trajectory)
+    return model
+
+
+def _labelled(trajectory: Trajectory, trip: Expedition, episode: int) -> Trajectory:
+    return replace(
+        trajectory,
+        reward=trajectory.reward if trip.rewards else None,
+        embodiment=trip.embodiment,
+        task=trip.task,
+        source=f"{trip.behaviour}, episode {episode}",
+    )
+
+
+def _explore_all(trip: Expedition) -> None:
+    for _ in explore(trip):
+        pass
+
+
+def explore_each(
+    trips: list[Expedition], workers: int, moved: Callable[[int], Any]
+) -> Iterator[TrajectoryDataset]:
+    """The datasets of the expeditions in their order.
+
+    :param moved: called now and then with how many episodes of all are stored
+    """
+    if workers < 2 or len(trips) < 2:
+        for trip in trips:
+            for _ in explore(trip):
+                moved(_stored(trips))
+            yield TrajectoryDataset.open(trip.folder / "data")
+        return
+    with worker_pool(workers) as pool:
+        futures = [pool.submit(_explore_all, trip) for trip in trips]
+        try:
+            for trip, future in zip(trips, futures, strict=True):
+                while not wait_for([future], timeout=1).done:
+                    moved(_stored(trips))
+                future.result()
+                yield TrajectoryDataset.open(trip.folder / "data")
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _stored(trips: list[Expedition]) -> int:
+    paths = [trip.folder / "data" for trip in trips]
+    return sum(len(TrajectoryDataset.open(p)) for p in paths if (p / "meta.json").exists())

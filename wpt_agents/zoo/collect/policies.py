@@ -1,0 +1,63 @@
+"""Saved policies as behaviours: a WPT model or one of Stable-Baselines3, with noise."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import stable_baselines3 as sb3
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.names import unknown_name
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "wpt": WPT,
+    **{name: getattr(sb3, name.upper()) for name in ("a2c", "ddpg", "ppo", "sac", "td3")},
+}
+
+
+@cache
+def load_policy(name: str) -> BaseAlgorithm:
+    """The model in the file `name`: WPT's, or another algorithm's as `sac:expert.zip`.
+
+    SB3's files hold pickles: load those that you trust.
+
+    :raises ValueError: an unknown algorithm, or a file that is not there
+    """
+    algorithm, _, path = name.rpartition(":")
+    if (algorithm or "wpt") not in ALGORITHMS:
+        raise unknown_name("algorithm", algorithm, ALGORITHMS)
+    if not Path(path).is_file():
+        raise ValueError(f"No policy {path}: give a model file, or `sac:FILE` for one of SB3's")
+    return ALGORITHMS[algorithm or "wpt"].load(path, device="cpu")
+
+
+def sees_states(name: str) -> bool:
+    """Whether the policy takes `info["state"]` and not the image."""
+    return len(load_policy(name).observation_space.shape or ()) == 1
+
+
+class SavedPolicy:
+    """One episode's actions in [-1, 1]: the deterministic policy's, with Gaussian noise.
+
+    :param width: of the task's actions
+    """
+
+    def __init__(self, rng: np.random.Generator, name: str, sigma: float, width: int) -> None:
+        self.rng, self.model, self.sigma = rng, load_policy(name), sigma
+        self.sees_states = sees_states(name)
+        self.state: tuple[np.ndarray, ...] | None = None
+        if self.model.action_space.shape != (width,):
+            raise ValueError(
+                f"{name} acts in {self.model.action_space}, the task takes {width} actions; give a "
+                "policy of this robot"
+            )
+
+    def __call__(self, obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
+        """(obs, info, step) -> (A,)."""
+        seen = np.asarray(info["state"], np.float32) if self.sees_states else obs
+        start = np.array([step == 0])
+        action, self.state = self.model.predict(seen, self.state, start, deterministic=True)
+        action = self.model.policy.scale_action(action)
+        return np.clip(action + self.rng.normal(0, self.sigma, len(action)), -1, 1)

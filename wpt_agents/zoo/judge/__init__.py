@@ -1,0 +1,1 @@
+"""Evaluation and diagnosis of policies and world models."""

@@ -1,0 +1,151 @@
+"""Why a policy earns what it earns: what its world model promises, beside what then happens.
+
+An actor that learns in imagination is as good as the model is. Where the dream of its own actions
+pays far more than reality, it exploits the model's errors; where the dream of the actions that were
+taken does, the dynamics are wrong; where the critic alone promises more, the critic is.
+"""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import astuple, dataclass, replace
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import torch
+from rich.table import Table
+from torch import Generator, Tensor
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
+from wpt_agents.model.policy import WPTPolicy
+from wpt_agents.model.rssm import Latent
+from wpt_agents.zoo.collect.collect import record
+from wpt_agents.zoo.collect.trained import Trained
+from wpt_agents.zoo.judge.evaluation import acting
+from wpt_agents.zoo.run.stages import console
+
+SAMPLES = 16  # dreams from each state
+STARTS = 5  # states of an episode, evenly spaced
+
+
+@dataclass(frozen=True)
+class Promise:
+    """From one state of an episode on: rewards a step over the horizon, and the return.
+
+    :param start: the state's step; a mean where episodes differ in length
+    :param earned: what was earned
+    :param same_actions: what the model expects of the actions that were taken
+    :param own_actions: what it expects of the actor
+    :param value: the critic's
+    :param discounted: what that stands for, Eq. (2)'s return to the episode's end: of arriving in
+        the state, and discounted of all that follows
+    """
+
+    start: float
+    earned: float
+    same_actions: float
+    own_actions: float
+    value: float
+    discounted: float
+
+
+@torch.no_grad()
+def promises(
+    policy: WPTPolicy, trajectory: Trajectory, gamma: float, starts: Sequence[int], horizon: int
+) -> list[Promise]:
+    """What the networks expect at some steps of an episode, and what came.
+
+    :param trajectory: with rewards, its actions in [-1, 1]
+    :param starts: steps, each at least `horizon` before the end
+    """
+    assert trajectory.reward is not None
+    width, model = policy.max_action_dim, policy.world_model
+    generator = Generator(policy.device).manual_seed(0)
+    batch = stack_windows([led_to(trajectory, 0, len(trajectory) + 1, width)]).to(policy.device)
+    post, _, _ = model.observe(batch, generator)
+    value, found = policy.critic.value(post.feat)[0], []
+    for start in starts:
+        state = Latent(*(x[:, start].repeat_interleave(SAMPLES, 0) for x in post))
+        taken = batch.action[:, start + 1 : start + 1 + horizon].expand(SAMPLES, -1, -1)
+        same, _ = model.rssm.imagine(state, partial(_taken, taken), horizon, generator)
+        own, _ = model.rssm.imagine(state, lambda s, _: _mode(policy, s), horizon, generator)
+        same_actions, own_actions = (
+            float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, own)
+        )
+        arriving, rest = float(batch.reward[0, start]), trajectory.reward[start:]
+        found.append(
+            Promise(
+                start,
+                float(rest[:horizon].mean()),
+                same_actions,
+                own_actions,
+                float(value[start]),
+                arriving + float(rest @ gamma ** np.arange(1, len(rest) + 1)),
+            )
+        )
+    return found
+
+
+def _taken(actions: Tensor, _: Latent, t: int) -> Tensor:
+    return actions[:, t]
+
+
+def _mode(policy: WPTPolicy, state: Latent) -> Tensor:
+    return policy.actor.dist(state.feat, policy.action_mask).mode
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Means over episodes.
+
+    :param returns: of each
+    :param reward_error: mean absolute error a step of the reward head on filtered states
+    :param promises: by start
+    """
+
+    returns: list[float]
+    reward_error: float
+    promises: list[Promise]
+
+
+def diagnose(
+    trained: Trained, episodes: int, seed: int, horizon: int, device: str = "auto"
+) -> Diagnosis:
+    """Plays episodes with a trained model's actor and asks its networks about them.
+
+    :raises ValueError: an episode that is not longer than `horizon`
+    """
+    model = trained.load(device=device)
+    assert isinstance(model, WPT)
+    low, high = model.action_space.low, model.action_space.high
+    returns, errors, found = list[float](), list[float](), list[list[Promise]]()
+    with closing(gym.make(trained.task, **trained.env)) as env:
+        for episode in range(episodes):
+            played = record(env, acting(model), seed + episode)
+            if len(played) < horizon:
+                raise ValueError(f"An episode lasts {len(played)} steps: take a shorter --horizon")
+            unit = 2 * (played.action - low) / (high - low) - 1
+            played = replace(played, action=unit.astype(np.float32))
+            starts = np.linspace(0, len(played) - horizon, STARTS).astype(int).tolist()
+            assert played.reward is not None
+            returns.append(float(played.reward.sum()))
+            errors.append(model.policy.heldout_errors(played, len(played) + 1)["reward"])
+            found.append(promises(model.policy, played, model.gamma, starts, horizon))
+    means = [Promise(*np.mean([astuple(p) for p in each], 0)) for each in zip(*found, strict=True)]
+    return Diagnosis(returns, float(np.mean(errors)), means)
+
+
+def show(found: Diagnosis, horizon: int) -> None:
+    """Prints a table of the promises, and what else is known."""
+    title = f"Reward a step over {horizon} steps, and return, from a step on; means over episodes"
+    table = Table(title=title)
+    for name in ("step", "earned", "dream of the same actions", "dream of the actor"):
+        table.add_column(name, justify="right")
+    for name in ("critic's value", "discounted return"):
+        table.add_column(name, justify="right")
+    for row in found.promises:
+        table.add_row(f"{row.start:.0f}", *(f"{x:.2f}" for x in astuple(row)[1:]))
+    console.print(table)
+    console.print(f"Returns: {', '.join(f'{x:.0f}' for x in found.returns)}")
+    console.print(f"Reward head, on images it sees: {found.reward_error:.2f} off a step")

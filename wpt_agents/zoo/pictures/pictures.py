@@ -1,0 +1,111 @@
+"""What one wants to look at after a run: the learning curve, the policy's video, the dream."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")  # no display
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+from wpt_agents.zoo.judge.evaluation import Score
+
+INK, MUTED = "#1f2933", "#8a94a0"
+COLOURS = {"nothing": "#b0b7bf", "random": "#7f8a96", "prior actor": "#d98324", "WPT": "#2463a8"}
+
+
+def learning_curve(
+    path: str | os.PathLike[str],
+    title: str,
+    frames: np.ndarray,
+    returns: np.ndarray,
+    scores: Mapping[str, Score],
+    evaluations: tuple[np.ndarray, np.ndarray] | None = None,
+    window: int = 10,
+) -> None:
+    """Draws training returns over simulator frames, and the final scores as lines and a bar.
+
+    :param frames: (N,), at the end of each training episode
+    :param returns: (N,), of each training episode
+    :param scores: by policy; "WPT" becomes the point at the end
+    :param evaluations: frames (M,) and returns (M, episodes) of evaluations in between
+    """
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    axes.plot(frames, returns, ".", color=COLOURS["WPT"], alpha=0.3, label="training episodes")
+    if len(returns) >= window:
+        smooth = np.convolve(returns, np.ones(window) / window, "valid")
+        label = f"their mean over {window}"
+        axes.plot(frames[window - 1 :], smooth, color=COLOURS["WPT"], lw=2, label=label)
+    if evaluations is not None:
+        at, each = evaluations
+        axes.plot(at, each.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
+    for name, score in scores.items():
+        if name == "WPT":
+            _final_point(axes, max(frames, default=0), score)
+        else:
+            mean = score.interval[0]
+            axes.axhline(mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
+            text = f"{name} {mean:.0f}"
+            axes.annotate(text, (0.01, mean), xycoords=("axes fraction", "data"), va="bottom")
+    axes.set(title=title, xlabel="simulator frames", ylabel="episode return")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(edgecolor="none", framealpha=0.9, loc="best")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _final_point(axes: Axes, at: float, score: Score) -> None:
+    """The evaluation at the end, with its 95 % interval."""
+    mean, low, high = score.interval
+    bar = [[mean - low], [high - mean]] if low is not None and high is not None else None
+    style: dict[str, Any] = {"fmt": "D", "color": COLOURS["WPT"], "mec": "white", "ms": 9}
+    label = f"WPT at the end, {mean:.0f}"
+    axes.errorbar([at], [mean], bar, label=label, capsize=4, zorder=3, **style)
+
+
+def prediction_strip(
+    path: str | os.PathLike[str],
+    title: str,
+    true: np.ndarray,
+    predicted: np.ndarray,
+    context: int,
+    columns: int = 12,
+) -> None:
+    """Draws true images above open-loop predicted ones, the observed part set apart.
+
+    :param true: (T, 64, 64, 3) uint8
+    :param predicted: (T, 64, 64, 3) uint8; the first `context` are reconstructions
+    """
+    assert true.shape == predicted.shape, (true.shape, predicted.shape)
+    seen = [0, context - 1]
+    dreamt = np.linspace(context, len(true) - 1, columns - len(seen)).round().astype(int)
+    steps = [*seen, *dict.fromkeys(dreamt.tolist())]
+    figure, axes = plt.subplots(
+        2, len(steps), figsize=(len(steps), 2.75), layout="constrained", squeeze=False
+    )
+    for column, step in enumerate(steps):
+        for row, images in enumerate((true, predicted)):
+            axes[row, column].imshow(images[step])
+            axes[row, column].set(xticks=[], yticks=[])
+            axes[row, column].spines[:].set_color(COLOURS["WPT"] if step < context else INK)
+        label = f"step {step}\nseen" if step < context else f"+{step - context + 1}"
+        axes[0, column].set_title(label, fontsize=9, color=INK)
+    axes[0, 0].set_ylabel("true")
+    axes[1, 0].set_ylabel("predicted")
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def video(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
+    """Writes an mp4 that plays in any browser.
+
+    :param frames: each (H, W, 3) uint8, H and W multiples of 16
+    """
+    imageio.mimwrite(Path(path), list(frames), fps=fps, codec="libx264", quality=7)

@@ -1,0 +1,1 @@
+"""Presets, and the runs that a command asks for."""

@@ -1,0 +1,257 @@
+"""What a run is to do: zoo/<suite>.yaml, read, merged and checked before any work begins."""
+
+import inspect
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self, get_type_hints
+
+import yaml
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.names import unknown_name
+
+# What the runner itself hands to WPT, so no preset may.
+OWN_KEYWORDS = {
+    *("policy", "env", "dataset", "seed", "device", "verbose", "tensorboard_log"),
+    *("embodiment", "episode_length"),  # the task's
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a preset: a dataclass that refuses unknown keys and wrong types."""
+
+    @classmethod
+    def of(cls, title: str, given: Mapping[str, Any]) -> Self:
+        """Builds the section `title` from what a YAML file or --set gives."""
+        types = get_type_hints(cls)
+        for key, value in given.items():
+            if key not in types:
+                raise unknown_name(f"{title} key", key, types)
+            if not _fits(value, types[key]):
+                name = getattr(types[key], "__name__", types[key])
+                raise ValueError(f"{title}.{key} must be of type {name}, got {value!r}.")
+            if types[key] is int and value < 0:
+                raise ValueError(f"{title}.{key} must not be negative, got {value}.")
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value read from YAML may stand in a field of type `kind`."""
+    if kind in (int, float):
+        return isinstance(value, (int, kind)) and not isinstance(value, bool)
+    if kind in (str, bool):
+        return isinstance(value, kind)
+    return isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value)
+
+
+@dataclass(frozen=True)
+class EnvSettings(Section):
+    """How the tasks are simulated; these are keyword arguments of `gym.make`."""
+
+    action_repeat: int = 2
+    rendering: str = "near"
+
+
+@dataclass(frozen=True)
+class CollectSettings(Section):
+    """The non-curated data: `episodes` of each of `tasks`, of "noise" or of "scripted" policies."""
+
+    tasks: tuple[str, ...] = ()
+    episodes: int = 30
+    seed: int = 0
+    behaviour: str = "noise"
+
+
+@dataclass(frozen=True)
+class PretrainSettings(Section):
+    """Pre-training of the world model, the same for every seed of a run."""
+
+    steps: int = 200_000
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class LearnSettings(Section):
+    """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
+
+    `checkpoint_every` so many frames a killed run can go on from there; 0: only from the end.
+    With `train_freq: step` the environment has a process of its own and steps beside the updates;
+    `overlap: false` keeps it in the learner's, which learns the same.
+    """
+
+    frames: int = 150_000
+    checkpoint_every: int = 10_000
+    overlap: bool = True
+
+
+@dataclass(frozen=True)
+class EvaluateSettings(Section):
+    """Evaluation: `episodes` at the end, and `during_episodes` every `every` frames (0: never).
+
+    With `keep_best` the policy that did best in between is scored at the end, on other episodes,
+    and the last one beside it.
+    """
+
+    episodes: int = 10
+    every: int = 0
+    during_episodes: int = 5
+    keep_best: bool = False
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Everything a run is to do, apart from task, method and seed.
+
+    :param wpt: keyword arguments of WPT and nothing else
+    """
+
+    env: EnvSettings = EnvSettings()
+    collect: CollectSettings = CollectSettings()
+    pretrain: PretrainSettings = PretrainSettings()
+    learn: LearnSettings = LearnSettings()
+    evaluate: EvaluateSettings = EvaluateSettings()
+    wpt: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        counts = {
+            "env.action_repeat": self.env.action_repeat,
+            "collect.episodes": self.collect.episodes,
+            "pretrain.steps": self.pretrain.steps,
+            "evaluate.episodes": self.evaluate.episodes,
+            "evaluate.during_episodes": self.evaluate.during_episodes,
+        }
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}.")
+        if self.steps < 1:
+            raise ValueError(
+                "learn.frames / env.action_repeat must be at least 1, got "
+                f"{self.learn.frames} / {self.env.action_repeat}."
+            )
+        for key in self.wpt:
+            if key not in wpt_keywords():
+                raise unknown_name("WPT keyword", key, wpt_keywords())
+
+    @classmethod
+    def of(cls, given: Mapping[str, Mapping[str, Any]]) -> Self:
+        """Builds a preset from the sections of a YAML file."""
+        types = get_type_hints(cls)
+        for title, section in given.items():
+            if title not in types:
+                raise unknown_name("section", title, types)
+            if not isinstance(section, Mapping):
+                raise ValueError(f"Section {title!r} must hold keys and values, got {section!r}.")
+        sections = {t: types[t].of(t, s) for t, s in given.items() if t != "wpt"}
+        return cls(**sections, wpt=dict(given.get("wpt", {})))
+
+    @property
+    def steps(self) -> int:
+        """The calls of `env.step` that `learn.frames` simulator frames make."""
+        return self.learn.frames // self.env.action_repeat
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain dictionaries and lists, as `config.yaml` shows them."""
+        given = asdict(self)
+        return given | {"collect": given["collect"] | {"tasks": list(self.collect.tasks)}}
+
+
+def wpt_keywords() -> dict[str, Any]:
+    """The keyword arguments of WPT that a preset may set, with their defaults."""
+    return {
+        name: parameter.default
+        for name, parameter in inspect.signature(WPT.__init__).parameters.items()
+        if name not in OWN_KEYWORDS | {"self"} and not name.startswith("_")
+    }
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which 1e-4 is a number: YAML 1.1 asks for 1.0e-4 and takes it for text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
+def read_yaml(text: str) -> Any:
+    """The value of a YAML document, no code ever run."""
+    return yaml.load(text, Loader=_Loader)  # a SafeLoader
+
+
+def preset_folder() -> Path:
+    """Where the YAML files stand: zoo/ in a checkout, wpt_agents/zoo/presets in a wheel."""
+    here = Path(__file__).resolve().parents[1]
+    for folder in (here / "presets", here.parents[1] / "zoo"):
+        if any(folder.glob("*.yaml")):
+            return folder
+    raise ValueError(f"No presets beside {here}: the installation is incomplete, reinstall it.")
+
+
+def suite_names() -> list[str]:
+    """The suites that have presets."""
+    return sorted(path.stem for path in preset_folder().glob("*.yaml"))
+
+
+def preset_names(suite: str) -> list[str]:
+    """The names of a suite's presets, as they stand in its file."""
+    return list(_read_suite(suite)["presets"])
+
+
+def _read_suite(suite: str) -> dict[str, Any]:
+    if suite not in suite_names():
+        raise unknown_name("suite with presets", suite, suite_names())
+    path = preset_folder() / f"{suite}.yaml"
+    try:
+        content = read_yaml(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not valid YAML: {error}") from None
+    if not isinstance(content, dict) or set(content) != {"default", "presets"}:
+        raise ValueError(f"{path} must hold the two sections `default` and `presets`.")
+    return content
+
+
+def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
+    """The preset `name` of `suite`, changed by `settings`.
+
+    :param settings: each "section.key=value", or "key=value" for a keyword of WPT
+    """
+    content = _read_suite(suite)
+    if name not in content["presets"]:
+        raise unknown_name(f"{suite} preset", name, content["presets"])
+    given: dict[str, dict[str, Any]] = {}
+    for part in (content["default"], content["presets"][name] or {}, *map(_setting, settings)):
+        for title, section in part.items():
+            given[title] = {**given.get(title, {}), **(section or {})}
+    return Preset.of(given)
+
+
+def keywords(settings: Sequence[str]) -> dict[str, Any]:
+    """Keywords of WPT from "key=value" each, every name valid, or ValueError."""
+    given: dict[str, Any] = {}
+    for title, section in (pair for text in settings for pair in _setting(text).items()):
+        for name in section:
+            if title != "wpt" or name not in wpt_keywords():
+                raise unknown_name("WPT keyword", name, wpt_keywords())
+        given |= section
+    return given
+
+
+def _setting(text: str) -> dict[str, dict[str, Any]]:
+    """Reads 'learn.frames=1000' as {'learn': {'frames': 1000}}; without a dot it is WPT's."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ValueError(f"--set wants key=value, got {text!r}.")
+    title, dot, key = key.strip().rpartition(".")
+    if not dot and key not in wpt_keywords():
+        sections = get_type_hints(Preset)
+        dotted = {f"{t}.{k}" for t, s in sections.items() if t != "wpt" for k in get_type_hints(s)}
+        raise unknown_name("key for --set", key, {*wpt_keywords(), *dotted})
+    try:
+        return {title or "wpt": {key: read_yaml(value)}}
+    except yaml.YAMLError:
+        raise ValueError(f"--set {key}: {value!r} is no valid YAML value.") from None

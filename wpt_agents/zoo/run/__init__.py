@@ -1,0 +1,1 @@
+"""Doing runs: stages, checkpoints, engines."""

@@ -1,0 +1,273 @@
+"""Where runs are done: each in a process of its own, on a Ray cluster, or as Slurm jobs.
+
+All engines do the same: first what runs share (data, pre-trained model), then one job a run, which
+goes on from its last checkpoint if its worker died before. The folders are the same too, and must
+stand on a file system that all machines see. Ray and submitit are imported only when asked for.
+"""
+
+import shutil
+import signal
+import sys
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.markup import escape
+
+from wpt_agents.files.names import counted
+from wpt_agents.zoo.collect.workers import end_with_parent
+from wpt_agents.zoo.machine import check_machine, import_extra
+from wpt_agents.zoo.plan.plan import METHODS, Run
+from wpt_agents.zoo.run import benchmark
+from wpt_agents.zoo.run.stages import console, locked, say
+from wpt_agents.zoo.run.watch import shown
+
+Work = Callable[[Run], None]
+Tick = Callable[[], None]  # called again and again while waiting; takes a moment
+Errors = dict[Path, str]  # by run folder, of the runs that failed
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What one job gets, and how often it is begun again when its worker dies.
+
+    :param hours: after which Slurm ends a job; it is sent again and goes on
+    :param address: of the Ray cluster; "" starts one on this machine
+    :param partition: Slurm's; "local" does the jobs on this machine without Slurm
+    """
+
+    workers: int = 2
+    cpus: int = 1
+    gpus: float = 0
+    memory_gb: float = 4
+    hours: float = 24
+    retries: int = 2
+    address: str = ""
+    partition: str = ""
+
+
+def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> bool:
+    """Does the runs on an engine and shows where they stand.
+
+    :return: whether all are finished
+    """
+    check_machine(engine, jobs[0].device)
+    jobs = [_at_absolute_paths(job) for job in jobs]
+    for job in jobs:
+        benchmark.check_folder(job, force)
+    runners: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
+    runner = runners[engine](given)
+    left = [job for job in jobs if force or job.result() is None]
+    anew = [job.folder for job in left] if force else []
+    with ExitStack() as held:
+        for folder in anew:  # all of them, before anything is deleted
+            held.enter_context(locked(folder / "lock"))
+        for folder in anew:
+            benchmark.clear(folder)
+    by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
+    shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
+    runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")
+    say("engine", f"{engine}: {len(left)} of {runs} to do, {cpus} each")
+    with shown(jobs) as tick:
+        if errors := runner.map(make_shared, list(shared.values()), tick):
+            reason = next(iter(errors.values()))
+            raise ValueError(f"What the runs share could not be made: {reason}")
+        errors = runner.map(do, left, tick)
+    for folder, error in errors.items():
+        console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")
+    return all(job.result() for job in jobs)
+
+
+def _at_absolute_paths(job: Run) -> Run:
+    data = job.data.resolve() if job.data is not None else None
+    return replace(job, out=job.out.resolve(), data=data)
+
+
+def make_shared(job: Run) -> None:
+    """A job's work: what `job` shares with other runs."""
+    with logged(job.out / "cache" / "log.txt"):
+        dataset = job.shared.data()
+        if METHODS[job.method].pretrained:
+            job.shared.model(dataset)
+
+
+def do(job: Run) -> None:
+    """A job's work: the run, from where it stands; what it says goes to its folder's `log.txt`."""
+    with logged(job.folder / "log.txt"):
+        benchmark.run(job)
+
+
+@contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Appends all that is printed to a file, bars too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    before = sys.stdout, sys.stderr
+    with open(path, "a", buffering=1) as file:
+        sys.stdout = sys.stderr = file
+        console.file = file
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = before
+            console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"
+
+
+class Local:
+    """`workers` processes at a time, one a run."""
+
+    def __init__(self, given: Resources) -> None:
+        self.given = given
+
+    def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
+        """Does the work of each job; a job whose process is killed goes on in another."""
+        waiting, deaths, errors = deque(jobs), Counter[Path](), {}
+        running: dict[BaseProcess, Run] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < self.given.workers:
+                    job = waiting.popleft()
+                    running[self.start(work, job)] = job
+                tick()
+                for process in [one for one in running if one.exitcode is not None]:
+                    job, code = running.pop(process), process.exitcode or 0
+                    deaths[job.folder] += code < 0
+                    if code < 0 and deaths[job.folder] <= self.given.retries:
+                        waiting.append(job)
+                    elif code:
+                        errors[job.folder] = why(job, code)
+        finally:
+            for process in running:
+                process.terminate()
+        return errors
+
+    def start(self, work: Work, job: Run) -> BaseProcess:
+        """A fresh process, so that no run inherits another's state."""
+        context = get_context("forkserver")  # which imports once what each run needs
+        context.set_forkserver_preload([benchmark.__name__])
+        process = context.Process(target=_in_child, args=(work, job, self.given.cpus))
+        process.start()
+        return process
+
+
+def _in_process(work: Work, job: Run, cpus: int) -> None:
+    torch.set_num_threads(cpus)
+    work(job)
+
+
+def _in_child(work: Work, job: Run, cpus: int) -> None:
+    end_with_parent()
+    _in_process(work, job, cpus)
+
+
+def why(job: Run, code: int) -> str:
+    """The last line of a failed run's traceback, or the signal that ended it."""
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    path = job.folder / "error.txt"
+    return path.read_text().strip().splitlines()[-1] if path.exists() else f"exit code {code}"
+
+
+class Ray:
+    """One task of a Ray cluster a run; Ray begins it again when its worker dies."""
+
+    def __init__(self, given: Resources) -> None:
+        self.given, self.ray = given, import_extra("ray", "ray")
+        if not self.ray.is_initialized():
+            try:
+                self.ray.init(address=given.address or None, log_to_driver=False)
+            except Exception as error:  # Ray raises a bare one when its processes do not start
+                raise ValueError(
+                    f"No Ray cluster answers at {given.address!r} ({error}); "
+                    "start one with `ray start --head`, or leave --address out"
+                ) from None
+        self.check_resources()
+
+    def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
+        """Does the work of each job; Ray does it again elsewhere when a worker dies."""
+        given, errors = self.given, {}
+        asked = {"num_cpus": given.cpus, "num_gpus": given.gpus}
+        asked |= {"memory": int(given.memory_gb * 2**30), "max_retries": given.retries}
+        task = self.ray.remote(**asked)(work)
+        waiting = {task.remote(job): job for job in jobs}
+        while waiting:
+            tick()
+            ready, _ = self.ray.wait(list(waiting), num_returns=len(waiting), timeout=0)
+            for reference in ready:
+                job = waiting.pop(reference)
+                try:
+                    self.ray.get(reference)
+                except self.ray.exceptions.RayError as error:
+                    errors[job.folder] = str(error).strip().splitlines()[-1]
+        return errors
+
+    def check_resources(self) -> None:
+        """Refuses to wait for what the cluster does not have."""
+        held, given = self.ray.cluster_resources(), self.given
+        memory = given.memory_gb * 2**30
+        for name, wanted in (("CPU", given.cpus), ("GPU", given.gpus), ("memory", memory)):
+            if held.get(name, 0) < wanted:
+                raise ValueError(
+                    f"The Ray cluster has {held.get(name, 0):g} {name}, a run asks for {wanted:g}: "
+                    "ask for less (--cpus, --gpus, --memory-gb), or add machines"
+                )
+
+
+class Slurm:
+    """One Slurm job a run, through submitit; preempted or out of time, it is sent again."""
+
+    def __init__(self, given: Resources) -> None:
+        self.given, self.submitit = given, import_extra("submitit", "slurm")
+        if given.partition != "local" and shutil.which("srun") is None:
+            raise ValueError(
+                "--engine slurm: there is no `srun` here; start it on a login node of the cluster, "
+                "or try it out with --partition local"
+            )
+
+    def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
+        """Does the work of each job; those that failed, with their errors."""
+        given, errors = Preemptible(work, self.given.cpus), {}
+        sent = [(job, self.executor(job.out).submit(given, job)) for job in jobs]
+        while not all(handle.done() for _, handle in sent):
+            tick()
+        for job, handle in sent:
+            if (error := handle.exception()) is not None:
+                errors[job.folder] = str(error).strip().splitlines()[-1]
+        return errors
+
+    def executor(self, out: Path) -> Any:
+        """submitit's, with the resources asked for; its logs go to `out/slurm`."""
+        given, local = self.given, self.given.partition == "local"
+        executor = self.submitit.AutoExecutor(out / "slurm", cluster="local" if local else "slurm")
+        executor.update_parameters(
+            name="wpt",
+            timeout_min=int(given.hours * 60),
+            cpus_per_task=given.cpus,
+            mem_gb=given.memory_gb,
+            gpus_per_node=int(given.gpus),
+        )
+        if given.partition and not local:
+            executor.update_parameters(slurm_partition=given.partition)
+        return executor
+
+
+@dataclass(frozen=True)
+class Preemptible:
+    """A job's work that Slurm may end; submitit then sends it again, from its last checkpoint."""
+
+    work: Work
+    cpus: int = 1
+
+    def __call__(self, job: Run) -> None:
+        """Does it."""
+        _in_process(self.work, job, self.cpus)
+
+    def checkpoint(self, job: Run) -> Any:
+        """What submitit asks for on preemption."""
+        submitit = import_extra("submitit", "slurm")
+        return submitit.helpers.DelayedSubmission(self, job)

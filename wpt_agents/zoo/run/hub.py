@@ -1,0 +1,123 @@
+"""Run folders to and from the Hugging Face hub, with a model card. Needs the extra `hub`."""
+
+import json
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from wpt_agents.zoo.collect.trained import find_trained
+from wpt_agents.zoo.machine import import_extra
+from wpt_agents.zoo.report import record, tables
+from wpt_agents.zoo.report.aggregates import score_of
+
+# What is shared; logs, replay and checkpoints stay at home.
+FILES = (
+    *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json"),
+    *("evaluations.npz", "0.monitor.csv", "policy.mp4", "learning_curve.png", "predictions.png"),
+    "retrieval.png",
+)
+VIDEO = "replay.mp4"  # the name that the hub shows a policy's video under
+
+
+def push(folder: Path, name: str, private: bool = False) -> str:
+    """Uploads a finished run and its card; the repository is made if it is not there.
+
+    :param name: `user/repository`
+    :return: the address
+    """
+    _check(name)
+    find_trained(folder)  # says what is missing, before anything is made
+    if not (folder / "result.json").exists():
+        raise ValueError(f"{folder} has no result.json: only finished runs are pushed")
+    api = import_extra("huggingface_hub", "hub").HfApi()
+    with tempfile.TemporaryDirectory() as aside:
+        for file in FILES:
+            if (folder / file).exists():
+                shutil.copy2(folder / file, Path(aside) / file)
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config.pop("data", None)  # in older runs a path on their machine
+        (Path(aside) / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+        if (folder / "policy.mp4").exists():
+            shutil.copy2(folder / "policy.mp4", Path(aside) / VIDEO)
+        (Path(aside) / "README.md").write_text(card(folder, name))
+        address = api.create_repo(name, private=private, exist_ok=True)
+        api.upload_folder(repo_id=name, folder_path=aside, commit_message="Upload a run")
+    return str(address)
+
+
+def pull(name: str, out: Path) -> Path:
+    """Downloads what `push` uploaded into the folder `out`, which must be new or empty."""
+    _check(name)
+    if out.exists() and any(out.iterdir()):
+        raise ValueError(f"{out} is not empty; name a new folder with --out")
+    hub = import_extra("huggingface_hub", "hub")
+    hub.snapshot_download(name, local_dir=out, allow_patterns=list(FILES))
+    if not (out / "config.yaml").exists():
+        raise ValueError(f"{name} holds no run of wpt_agents: it has no config.yaml")
+    return out
+
+
+def _check(name: str) -> None:
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
+        raise ValueError(f"{name!r} is no repository of the hub: write user/name")
+
+
+def card(folder: Path, name: str) -> str:
+    """The model card: metadata that the hub reads, scores of all policies, how to load it."""
+    result: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    score = score_of(result)
+    value = {"type": result["metric"], "name": f"mean {result['metric']}", "value": score}
+    about = {
+        "library_name": "wpt-agents",
+        "license": "mit",
+        "tags": ["reinforcement-learning", "world-model", "stable-baselines3", result["task"]],
+        "model-index": [
+            {
+                "name": name.split("/")[1],
+                "results": [
+                    {
+                        "task": {"type": "reinforcement-learning", "name": result["task"]},
+                        "dataset": {"type": result["suite"], "name": result["task"]},
+                        "metrics": [value],
+                    }
+                ],
+            }
+        ],
+    }
+    return _CARD.format(
+        about=yaml.safe_dump(about, sort_keys=False),
+        table=tables.markdown_table(
+            tables.POLICY_HEADINGS, map(tables.policy_cells, tables.policies([result]))
+        ),
+        command=record.command(result),
+        name=name,
+        folder=name.split("/")[1],
+        **{key: result[key] for key in ("task", "method", "preset", "seed", "frames", "commit")},
+    )
+
+
+_CARD = """---
+{about}---
+# {task}, {method}
+
+An agent of [wpt_agents](https://arxiv.org/abs/2502.19544), preset `{preset}`, seed {seed}, after
+{frames:,} simulator frames of `{task}`.
+
+{table}
+Commit {commit}. Made by:
+
+```bash
+{command}
+```
+
+Watch it:
+
+```bash
+python -m wpt_agents.zoo pull {name} --out {folder}
+python -m wpt_agents.zoo enjoy {folder}
+```
+"""

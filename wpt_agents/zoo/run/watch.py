@@ -1,0 +1,135 @@
+"""What the runs of a plan are at, one line each, read from their folders alone."""
+
+import fcntl
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.live import Live
+from rich.table import Table
+
+from wpt_agents.zoo.plan.plan import Run
+from wpt_agents.zoo.plan.tasks import short_name
+from wpt_agents.zoo.report.tables import number
+from wpt_agents.zoo.run.stages import console
+
+RECENT = 10  # episodes that return and speed are taken over
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a run stands.
+
+    :param state: "waiting", "preparing", "learning", "evaluating", "stopped", "failed", "finished"
+    :param steps: calls of `env.step` so far
+    :param mean_return: of the last episodes
+    :param speed: calls of `env.step` a second, updates included
+    """
+
+    state: str
+    steps: int = 0
+    mean_return: float | None = None
+    speed: float | None = None
+
+
+def standing(job: Run) -> Standing:
+    """Reads a run's folder; nothing is written, and the run may be on another machine."""
+    folder = job.folder
+    lengths, returns, times = read_monitor(folder / "0.monitor.csv")
+    steps = int(lengths.sum())
+    recent = float(returns[-RECENT:].mean()) if len(returns) else None
+    if (folder / "result.json").exists():
+        return Standing("finished", job.preset.steps, recent)
+    if (folder / "error.txt").exists():
+        return Standing("failed", steps, recent)
+    if not (folder / "config.yaml").exists():
+        return Standing("waiting")
+    if not is_locked(folder):
+        return Standing("stopped", steps, recent)
+    if not len(lengths):
+        return Standing("preparing")
+    state = "evaluating" if steps >= job.preset.steps else "learning"
+    return Standing(state, steps, recent, speed(lengths, times))
+
+
+def read_monitor(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lengths, returns and times (seconds) of SB3's Monitor; a last line half written is left."""
+    rows = []
+    if path.exists():
+        for line in path.read_text().splitlines(keepends=True)[2:]:
+            cells = line.split(",")
+            if line.endswith("\n") and len(cells) >= 3 and cells[0] != "r":
+                rows.append([float(cell) for cell in cells[:3]])
+    table = np.array(rows).reshape(-1, 3)
+    return table[:, 1], table[:, 0], table[:, 2]
+
+
+def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
+    """Steps a second over the last episodes since the process began; None with fewer than two."""
+    begins = np.flatnonzero(np.diff(times) < 0)  # a resumed run's clock begins anew
+    since = max(begins[-1] + 1 if len(begins) else 0, len(times) - RECENT)
+    lengths, times = lengths[since:], times[since:]
+    if len(times) < 2 or times[-1] <= times[0]:
+        return None
+    return float(lengths[1:].sum() / (times[-1] - times[0]))
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process works on the run; seen on other machines where the file system locks."""
+    path = folder / "lock"
+    if not path.exists():
+        return False
+    with open(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def overview(jobs: Sequence[Run]) -> Table:
+    """One line a run: progress, return, speed, time left."""
+    table = Table("task", "method", "seed", "state")
+    for heading in ("frames", "done", "return", "steps/s", "time left"):
+        table.add_column(heading, justify="right")
+    for job in jobs:
+        now, steps = standing(job), job.preset.steps
+        left = (steps - now.steps) / now.speed if now.speed else None
+        table.add_row(
+            *(short_name(job.task), job.method, str(job.seed), now.state),
+            f"{now.steps * job.preset.env.action_repeat:,}",
+            f"{min(now.steps / steps, 1):.0%}",
+            number(now.mean_return),
+            number(now.speed),
+            "-" if left is None else clock(left),
+        )
+    return table
+
+
+def clock(seconds: float) -> str:
+    """'1:02:03'."""
+    minutes, rest = divmod(round(max(seconds, 0)), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+@contextmanager
+def shown(jobs: Sequence[Run], every: float = 1.0) -> Iterator[Callable[[], None]]:
+    """Keeps `overview` on the terminal; what it yields waits a moment and renews it."""
+    with Live(overview(jobs), console=console, auto_refresh=False) as live:
+
+        def tick() -> None:
+            time.sleep(every)
+            live.update(overview(jobs), refresh=True)
+
+        yield tick
+        live.update(overview(jobs), refresh=True)
+
+
+def watch(jobs: Sequence[Run]) -> None:
+    """Shows `overview` until every run is finished or has failed; only looks."""
+    with shown(jobs) as tick:
+        while not all(standing(job).state in ("finished", "failed") for job in jobs):
+            tick()

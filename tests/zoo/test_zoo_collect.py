@@ -11,9 +11,9 @@ from zoo_command import call
 
 from wpt_agents.agents.curious import EXPLORE, Plan2Explore
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.collect import collect as module
 from wpt_agents.zoo.collect.behaviours import COLOURS, coloured_noise, noise_actions
 from wpt_agents.zoo.collect.collect import collect, record
-from wpt_agents.zoo.collect.collect import collect as module
 from wpt_agents.zoo.collect.curious import Expedition, explore
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 

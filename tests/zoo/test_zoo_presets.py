@@ -6,7 +6,8 @@ import pytest
 from debug_agent import recorded
 
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.plan.plan import make_plan, parse_seeds, presets
+from wpt_agents.zoo.plan import presets
+from wpt_agents.zoo.plan.plan import make_plan, parse_seeds
 from wpt_agents.zoo.plan.presets import (
     load_preset,
     preset_folder,

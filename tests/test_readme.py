@@ -19,11 +19,11 @@ from typer.main import get_command
 from wpt_envs import dmc
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.zoo import __main__ as command_line
-from wpt_agents.zoo.collect.collect import BEHAVIOURS
-from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.collect.collection import BEHAVIOURS
+from wpt_agents.zoo.commands import app as command_line
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import load_preset, suite_names
-from wpt_agents.zoo.plan.tasks import find_tasks
+from wpt_agents.zoo.tasks import find_tasks
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

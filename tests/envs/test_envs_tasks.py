@@ -12,7 +12,7 @@ import wpt_envs
 from wpt_envs import dmc, metaworld, robotics, tasks
 from wpt_envs.simulated import Simulated
 
-from wpt_agents.zoo import __main__ as command_line
+from wpt_agents.zoo.commands import app as command_line
 
 IMPORT = """
 import sys, wpt_envs

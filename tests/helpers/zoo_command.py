@@ -2,7 +2,7 @@
 
 import sys
 
-from wpt_agents.zoo import __main__ as command_line
+from wpt_agents.zoo.commands import app as command_line
 
 
 def call(monkeypatch, *words):

@@ -19,7 +19,7 @@ from wpt_agents.files.model_file import read_model
 from wpt_agents.model.distributions import Share, exponential
 from wpt_agents.model.world_model import world_model_loss
 from wpt_agents.training.distributed import World
-from wpt_agents.zoo import __main__ as command_line
+from wpt_agents.zoo.commands import app as command_line
 
 JOBS = {
     "mean": {},  # free nats that the KL crosses on its way are put in below

@@ -23,15 +23,18 @@ from zoo_command import call
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo import __main__ as command_line
-from wpt_agents.zoo.judge.evaluation import DoNothing, RandomPolicy, evaluate, make_vec_env
-from wpt_agents.zoo.plan.plan import METHODS, Run, make_plan
+from wpt_agents.zoo.commands import app as command_line
+from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
+from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import Preset
+from wpt_agents.zoo.plan.runs import Run, make_plan
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.report.folders import read_results
-from wpt_agents.zoo.run import benchmark, stages
-from wpt_agents.zoo.run.benchmark import run
+from wpt_agents.zoo.run import runner, shared
+from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.statistics import mean_interval
+from wpt_agents.zoo.terminal import console
 
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
 SECTIONS = {
@@ -63,7 +66,7 @@ def make_dot(action_repeat=1, rendering="fast", render_size=None, render_mode="r
 def dot(monkeypatch):
     monkeypatch.setitem(TASKS, DOT.id, DOT)
     gym.register(DOT.id, entry_point=make_dot)
-    monkeypatch.setattr(stages.console, "_width", 160)
+    monkeypatch.setattr(console, "_width", 160)
     yield
     del gym.registry[DOT.id]
 
@@ -107,9 +110,9 @@ def test_every_method_runs(tmp_path, method):
 
 
 def test_an_environment_beside_the_learner_changes_nothing_but_the_time(tmp_path, monkeypatch):
-    made, before = [], benchmark.make_vec_env
+    made, before = [], runner.make_vec_env
     monkeypatch.setattr(
-        benchmark, "make_vec_env", lambda *a, **k: made.append(before(*a, **k)) or made[-1]
+        runner, "make_vec_env", lambda *a, **k: made.append(before(*a, **k)) or made[-1]
     )
     reach, scores = TASKS["wpt/metaworld-reach-v0"], []
     wpt = {"train_freq": "step", "max_action_dim": 4, "train_ratio": 1}
@@ -141,7 +144,7 @@ def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
     done = (job(tmp_path).folder / "result.json").stat().st_mtime_ns
     assert run(job(tmp_path)) == first
     assert (job(tmp_path).folder / "result.json").stat().st_mtime_ns == done
-    monkeypatch.setattr(benchmark, "_work", lambda job: {"scores": "anew"})
+    monkeypatch.setattr(runner, "_work", lambda job: {"scores": "anew"})
     assert run(job(tmp_path), force=True) == {"scores": "anew"}
 
 
@@ -149,7 +152,7 @@ def test_a_second_seed_reuses_data_model_and_index_and_says_so(tmp_path, monkeyp
     run(job(tmp_path))
     capsys.readouterr()
     monkeypatch.setattr(WPT, "pretrain", lambda *_, **__: pytest.fail("pre-trained again"))
-    monkeypatch.setattr(stages, "evaluate", lambda *_: pytest.fail("no new baseline of this seed"))
+    monkeypatch.setattr(shared, "evaluate", lambda *_: pytest.fail("no new baseline of this seed"))
     with pytest.raises(pytest.fail.Exception, match="baseline"):
         run(job(tmp_path, seed=1))
     said = capsys.readouterr().out
@@ -199,8 +202,8 @@ def test_a_failure_whose_words_look_like_markup_ends_one_run_and_not_all(
     def fail(one, force):
         raise OSError(f"could not read [/data/{one.seed}.bin]")
 
-    monkeypatch.setattr(benchmark, "run", fail)
-    assert not benchmark.run_all([job(tmp_path), job(tmp_path, seed=1)])
+    monkeypatch.setattr(runner, "run", fail)
+    assert not runner.run_all([job(tmp_path), job(tmp_path, seed=1)])
     said = capsys.readouterr().out
     assert "read [/data/0.bin]" in said and "read [/data/1.bin]" in said
     assert "error.txt" not in said  # there is none
@@ -209,7 +212,7 @@ def test_a_failure_whose_words_look_like_markup_ends_one_run_and_not_all(
 def test_without_git_a_run_is_of_no_commit(monkeypatch):
     monkeypatch.setattr("shutil.which", lambda _: None)
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("asked git"))
-    assert benchmark.commit.__wrapped__() is None
+    assert runner.commit.__wrapped__() is None
 
 
 def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):
@@ -234,18 +237,18 @@ def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
         raise RuntimeError("out of luck")
 
     with monkeypatch.context() as broken:
-        broken.setattr(benchmark, "_learn", die)
-        assert not benchmark.run_all([job(tmp_path), job(tmp_path, "scratch")])
+        broken.setattr(runner, "_learn", die)
+        assert not runner.run_all([job(tmp_path), job(tmp_path, "scratch")])
     assert "out of luck" in (job(tmp_path).folder / "error.txt").read_text()
     assert not (job(tmp_path).folder / "result.json").exists()
-    assert benchmark.run_all([job(tmp_path)])
+    assert runner.run_all([job(tmp_path)])
     assert not (job(tmp_path).folder / "error.txt").exists()
 
 
 def test_a_finished_run_of_other_settings_is_refused_before_any_work(tmp_path):
     run(job(tmp_path))
     with pytest.raises(ValueError, match=r"other settings \(wpt.gamma\).*--out"):
-        benchmark.run_all([job(tmp_path, seed=1), job(tmp_path, wpt={"gamma": 0.5})])
+        runner.run_all([job(tmp_path, seed=1), job(tmp_path, wpt={"gamma": 0.5})])
     assert not job(tmp_path, seed=1).folder.exists()
 
 

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.model import networks
 from wpt_agents.model.networks import BlockLinear, FromPixel, ToPixels, UpConv
-from wpt_agents.zoo.__main__ import app
 from wpt_agents.zoo.bench import model as bench_model
 from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
+from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.commands.options import print_table
 
 KEYS = {
@@ -142,7 +142,7 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}", name="h5py")
 
-    monkeypatch.setattr("wpt_agents.zoo.bench.command.importlib.import_module", missing)
+    monkeypatch.setattr("wpt_agents.zoo.commands.bench.importlib.import_module", missing)
     ran = CliRunner().invoke(app, ["bench", "data"])
     assert isinstance(ran.exception, ValueError) and "h5py" in str(ran.exception)
     ran = CliRunner().invoke(app, ["bench", "--quick"])

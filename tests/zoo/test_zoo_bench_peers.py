@@ -6,8 +6,8 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
-from wpt_agents.zoo.__main__ import app
 from wpt_agents.zoo.bench import peers
+from wpt_agents.zoo.commands.app import app
 
 
 @pytest.mark.parametrize("peer", peers.PEERS)

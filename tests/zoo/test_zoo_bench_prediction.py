@@ -16,10 +16,10 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.networks import to_unit
 from wpt_agents.model.world_model import squared_error
-from wpt_agents.zoo.__main__ import app
 from wpt_agents.zoo.bench import prediction as bench
+from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.judge import prediction
-from wpt_agents.zoo.pictures import prediction_pictures
+from wpt_agents.zoo.pictures import predictions as prediction_pictures
 
 PIXELS = 64 * 64 * 3
 

@@ -11,10 +11,11 @@ from zoo_command import call
 
 from wpt_agents.agents.curious import EXPLORE, Plan2Explore
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.collect import collect as module
+from wpt_agents.zoo.collect import collection as module
 from wpt_agents.zoo.collect.behaviours import COLOURS, coloured_noise, noise_actions
-from wpt_agents.zoo.collect.collect import collect, record
+from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.curious import Expedition, explore
+from wpt_agents.zoo.collect.episodes import record
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 
 gym.register("PlainDot-v0", entry_point="toy_env:DotEnv")
@@ -95,7 +96,7 @@ def test_trajectories_have_no_rewards_and_their_own_width(tmp_path):
 
 def test_the_stored_actions_lead_to_the_stored_images(tmp_path):
     (stored,) = collect(tmp_path / "data", [DOT], 1, seed=5, workers=1, progress_bar=False)
-    entropy = [5, module.zlib.crc32(DOT.encode()), 0]
+    entropy = [5, zlib.crc32(DOT.encode()), 0]
     seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
     replayed = record(gym.make(DOT), lambda obs, info, t: stored.action[t], seed)
     assert np.array_equal(replayed.image, stored.image)
@@ -160,7 +161,7 @@ def killed(*_):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("where", ["wpt_agents.data.index", "wpt_agents.zoo.collect.collect"])
+@pytest.mark.parametrize("where", ["wpt_agents.data.index", "wpt_agents.zoo.collect.collection"])
 def test_a_collection_killed_while_its_folder_is_made_goes_on(tmp_path, monkeypatch, where):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(f"{where}.replacing", killed)  # no meta.json yet, or no collect.json yet
@@ -366,7 +367,7 @@ def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypat
         call(monkeypatch, "collect", "--suite", "metaworld", "--out", tmp_path)
     [((_, tasks, episodes, seed, _, behaviour, _), more)] = asked
     assert (len(tasks), episodes, seed, behaviour) == (50, 1000, 0, "scripted")
-    plan = module.Plan(sigmas=tuple(more["sigmas"]))
+    plan = episodes.Recipe(sigmas=tuple(more["sigmas"]))
     count = Counter(plan.sigma(episode) for episode in range(episodes))
     assert count == {0.1: 200, 0.3: 200, 0.5: 200, 1.0: 200, 2.0: 200}
     assert not more["rewards"]

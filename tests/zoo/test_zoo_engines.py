@@ -14,9 +14,11 @@ from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
 from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
-from wpt_agents.zoo.run import engines, stages
+from wpt_agents.zoo.run import engines
 from wpt_agents.zoo.run.engines import Local, Ray, Resources, Slurm, run_on
+from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.watch import standing
+from wpt_agents.zoo.terminal import console
 
 PLACES = os.pathsep.join(
     [str(Path(__file__).parents[1] / "helpers"), *filter(None, sys.path)]
@@ -86,7 +88,7 @@ def test_force_deletes_nothing_unless_it_can_begin(jobs):
         (one.folder / "config.yaml").write_text(yaml.safe_dump(one.config()))
         (one.folder / "result.json").write_text("{}")
     with (
-        stages.locked(jobs[1].folder / "lock"),
+        locked(jobs[1].folder / "lock"),
         pytest.raises(ValueError, match="worked on by another process"),
     ):
         run_on("local", jobs, True, Resources())
@@ -177,9 +179,9 @@ def test_slurm_that_is_not_here_is_told(monkeypatch):
 
 
 def test_the_consoles_file_is_given_back(tmp_path):
-    before = stages.console.file
+    before = console.file
     with engines.logged(tmp_path / "log.txt"):
-        stages.console.print("said")
+        console.print("said")
         print("printed")
-    assert stages.console.file is before
+    assert console.file is before
     assert (tmp_path / "log.txt").read_text() == "said\nprinted\n"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from run_folders import make_run
 
-from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import aggregates, figures, sections
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.folders import read_results

@@ -7,7 +7,6 @@ from debug_agent import recorded
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.plan import presets
-from wpt_agents.zoo.plan.plan import make_plan, parse_seeds
 from wpt_agents.zoo.plan.presets import (
     load_preset,
     preset_folder,
@@ -15,7 +14,8 @@ from wpt_agents.zoo.plan.presets import (
     read_yaml,
     suite_names,
 )
-from wpt_agents.zoo.plan.tasks import find_tasks
+from wpt_agents.zoo.plan.runs import make_plan, parse_seeds
+from wpt_agents.zoo.tasks import find_tasks
 
 ALL = [(suite, name) for suite in suite_names() for name in preset_names(suite)]
 

@@ -6,8 +6,8 @@ import pytest
 from run_folders import make_run
 from typer.testing import CliRunner
 
-from wpt_agents.zoo.__main__ import app
-from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.commands.app import app
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
 

@@ -22,11 +22,11 @@ from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for ea
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
-from wpt_agents.zoo.run import benchmark, stages
-from wpt_agents.zoo.run.benchmark import run
+from wpt_agents.zoo.run import locks, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
+from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.progress import LearningBar
-from wpt_agents.zoo.run.stages import locked
+from wpt_agents.zoo.run.runner import run
 
 CHANGES = {
     "learn": {"frames": 150, "checkpoint_every": 25},
@@ -52,7 +52,7 @@ class KillAt(LearningBar):
 def killed_at(step, monkeypatch, one):
     """Does the run until `step`, and no more."""
     with monkeypatch.context() as patch:
-        patch.setattr(benchmark, "LearningBar", lambda _: KillAt(step))
+        patch.setattr(runner, "LearningBar", lambda _: KillAt(step))
         with pytest.raises(Killed):
             run(one)
 
@@ -100,7 +100,7 @@ def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch,
 def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):
     one = job(tmp_path, **CHANGES)
     with monkeypatch.context() as patch:
-        patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+        patch.setattr(runner, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
         with pytest.raises(Killed):
             run(one)
     before = weights(WPT.load(one.folder / "model.zip"))
@@ -148,7 +148,7 @@ def test_a_run_that_another_process_works_on_is_refused(tmp_path):
 def test_who_only_looks_whether_a_run_is_locked_does_not_keep_it_from_starting(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(stages, "PATIENCE", 10)
+    monkeypatch.setattr(locks, "PATIENCE", 10)
     with open(tmp_path / "lock", "w") as looking:
         fcntl.flock(looking, fcntl.LOCK_SH)
         threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN)).start()
@@ -179,7 +179,7 @@ def test_the_checkpoint_at_the_end_is_not_written_twice(tmp_path, monkeypatch):
     one, written = job(tmp_path, learn={"frames": 150, "checkpoint_every": 0}), []
     for _ in range(2):
         with monkeypatch.context() as patch:
-            patch.setattr(benchmark, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+            patch.setattr(runner, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
             with pytest.raises(Killed):
                 run(one)
         (state,) = one.folder.glob("checkpoints/*/state.json")

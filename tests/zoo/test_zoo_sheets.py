@@ -11,7 +11,7 @@ from zoo_command import call
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.zoo.pictures import sheets
+from wpt_agents.zoo.pictures import datasets, retrieval
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def dataset(tmp_path):
 
 
 def test_the_table_counts_robot_by_robot_and_all(dataset):
-    table = sheets.data_table(dataset)
+    table = datasets.data_table(dataset)
     rows = {
         cells[0]: cells[1:]
         for cells in zip(*(list(column.cells) for column in table.columns), strict=True)
@@ -43,11 +43,11 @@ def test_the_table_counts_robot_by_robot_and_all(dataset):
 
 
 def test_what_is_shown_is_of_every_kind_first(dataset):
-    assert sheets.spread(dataset, 2) == [0, 3]
-    assert sheets.spread(dataset, 4) == [0, 1, 2, 3]
-    assert sorted(sheets.spread(dataset, 99)) == [0, 1, 2, 3, 4]
+    assert datasets.spread(dataset, 2) == [0, 3]
+    assert datasets.spread(dataset, 4) == [0, 1, 2, 3]
+    assert sorted(datasets.spread(dataset, 99)) == [0, 1, 2, 3, 4]
     only = dataset.subset([0, 3, 4])
-    assert sheets.spread(only, 3) == [0, 1, 2]
+    assert datasets.spread(only, 3) == [0, 1, 2]
 
 
 def test_data_show_prints_the_table_and_draws_the_images(dataset, tmp_path, monkeypatch, capsys):
@@ -68,17 +68,17 @@ def test_a_folder_that_is_no_dataset_is_named(tmp_path, monkeypatch, capsys):
 
 def test_a_search_leaves_the_query_out_and_keeps_to_its_robot_if_told_to(dataset):
     model = agent(DotEnv(), dataset=dataset)
-    query = sheets.query_of(dataset, 3)
-    near, distances = sheets.search(model, query, 4, own_robot=False)[1:]
+    query = retrieval.query_of(dataset, 3)
+    near, distances = retrieval.search(model, query, 4, own_robot=False)[1:]
     assert near[0] == 4 and 3 not in near and sorted(near) == [0, 1, 2, 4]
     assert (np.diff(distances) >= 0).all()
-    assert sheets.search(model, query, 4, own_robot=True).indices.tolist() == [4]
+    assert retrieval.search(model, query, 4, own_robot=True).indices.tolist() == [4]
     with pytest.raises(ValueError, match=r"No trajectory 5: .* holds 5, from 0 on"):
-        sheets.query_of(dataset, 5)
+        retrieval.query_of(dataset, 5)
 
 
 def test_a_task_is_searched_for_by_its_first_image():
-    query = sheets.query_at(find("metaworld", "reach"), {"rendering": "fast"})
+    query = retrieval.query_at(find("metaworld", "reach"), {"rendering": "fast"})
     env = gym.make("wpt/metaworld-reach-v0", rendering="fast")
     np.testing.assert_array_equal(query.image, env.reset(seed=0)[0])
     assert (query.embodiment, query.action_dim) == ("sawyer", 4)

@@ -18,10 +18,10 @@ from zoo_command import call
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
-from wpt_agents.zoo.collect.trained import find_trained
 from wpt_agents.zoo.judge.diagnosis import promises
-from wpt_agents.zoo.run.benchmark import run
-from wpt_agents.zoo.run.hub import card, pull, push
+from wpt_agents.zoo.judge.trained import find_trained
+from wpt_agents.zoo.report.hub import card, pull, push
+from wpt_agents.zoo.run.runner import run
 
 
 @pytest.fixture
@@ -53,9 +53,7 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     model = shutil.copy(folder / "model.zip", tmp_path / "alone.zip")
     words = ["--task", "dmc-dot", "--episodes", "1"]
     assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
-    monkeypatch.setattr(
-        "wpt_agents.zoo.collect.trained._config", lambda _: {"env": SECTIONS["env"]}
-    )
+    monkeypatch.setattr("wpt_agents.zoo.judge.trained._config", lambda _: {"env": SECTIONS["env"]})
     assert call(monkeypatch, "eval", model, *words) == 0
 
 

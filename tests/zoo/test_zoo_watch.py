@@ -9,8 +9,8 @@ from stable_baselines3.common.results_plotter import load_results, plot_results,
 from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
-from wpt_agents.zoo.run.benchmark import run
-from wpt_agents.zoo.run.stages import locked
+from wpt_agents.zoo.run.locks import locked
+from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.watch import clock, overview, read_monitor, speed, standing
 
 HEAD = '#{"t_start": 1.0}\nr,l,t\n'

@@ -23,7 +23,7 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.data.windows import Windows
 from wpt_agents.zoo.bench.formats import FORMATS, Read, store
 from wpt_agents.zoo.bench.timing import memory_mib
-from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.workers import worker_pool
 
 Rows = Iterator[dict[str, Any]]

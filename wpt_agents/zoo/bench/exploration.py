@@ -15,7 +15,7 @@ import numpy as np
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions
-from wpt_agents.zoo.collect.collect import record
+from wpt_agents.zoo.collect.episodes import record
 
 TASK = "wpt/dmc-walker-stand-v0"
 BEHAVIOURS = ("random", "noise", "icm", "plan2explore")

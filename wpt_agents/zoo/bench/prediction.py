@@ -14,7 +14,7 @@ import torch
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.judge.prediction import (
     MeanFrame,
     Predict,

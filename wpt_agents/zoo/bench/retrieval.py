@@ -18,7 +18,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.zoo.bench.timing import memory_mib
-from wpt_agents.zoo.collect.collect import collect
+from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.workers import worker_pool
 
 FOLDER = Path("runs") / "bench" / "retrieval"

@@ -68,9 +68,9 @@ def collect_data(
 
     Example: `python -m wpt_agents.zoo collect --tasks walker-run --behaviour icm --out data`
     """
-    from wpt_agents.zoo.collect.collect import collect
+    from wpt_agents.zoo.collect.collection import collect
     from wpt_agents.zoo.plan.presets import keywords, load_preset, suite_names
-    from wpt_agents.zoo.plan.tasks import find_tasks
+    from wpt_agents.zoo.tasks import find_tasks
 
     paper = load_preset(suite, "paper").collect if suite in suite_names() else None
     names = tasks or (paper.tasks if paper else ())
@@ -152,8 +152,8 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 def _print_summary(dataset: "TrajectoryDataset") -> None:
     """What the dataset holds, robot by robot, and where it is."""
-    from wpt_agents.zoo.pictures.sheets import data_table
-    from wpt_agents.zoo.run.stages import console
+    from wpt_agents.zoo.pictures.datasets import data_table
+    from wpt_agents.zoo.terminal import console
 
     console.print(data_table(dataset))
     typer.echo(f"Dataset: {dataset.path.resolve()}")
@@ -169,7 +169,7 @@ def show_data(
     Example: `python -m wpt_agents.zoo data show data/two --out two.png`
     """
     from wpt_agents.data.dataset import TrajectoryDataset
-    from wpt_agents.zoo.pictures.sheets import contact_sheet
+    from wpt_agents.zoo.pictures.datasets import contact_sheet
 
     dataset = TrajectoryDataset.open(folder)
     _print_summary(dataset)
@@ -241,17 +241,17 @@ def show_retrieval(
     Example: `python -m wpt_agents.zoo retrieve show data/two --model m.zip --task walker-run`
     """
     from wpt_agents.agents.wpt import WPT
-    from wpt_agents.zoo.pictures import sheets
-    from wpt_agents.zoo.plan.tasks import find_tasks
+    from wpt_agents.zoo.pictures import datasets, retrieval
+    from wpt_agents.zoo.tasks import find_tasks
 
     agent = WPT.load(model, dataset=folder)
     assert agent.dataset is not None
-    queries = [sheets.query_of(agent.dataset, i) for i in query]
+    queries = [retrieval.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [sheets.query_at(row, {"rendering": str(rendering)}) for row in rows]
+    queries += [retrieval.query_at(row, {"rendering": str(rendering)}) for row in rows]
     if not queries:
-        chosen = sheets.spread(agent.dataset, 6)
-        queries = [sheets.query_of(agent.dataset, i) for i in chosen]
-    found = [sheets.search(agent, each, number, own_robot) for each in queries]
-    sheets.retrieval_sheet(out, agent.dataset, found)
+        chosen = datasets.spread(agent.dataset, 6)
+        queries = [retrieval.query_of(agent.dataset, i) for i in chosen]
+    found = [retrieval.search(agent, each, number, own_robot) for each in queries]
+    retrieval.retrieval_sheet(out, agent.dataset, found)
     typer.echo(f"Retrieval sheet: {out.resolve()}")

@@ -52,7 +52,7 @@ def print_table(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     """Prints rows of several columns each; what a row lacks stays empty."""
     from rich.table import Table
 
-    from wpt_agents.zoo.run.stages import console
+    from wpt_agents.zoo.terminal import console
 
     columns = list(dict.fromkeys(key for row in found for key in row))
     table = Table(title=title)
@@ -66,3 +66,6 @@ def print_table(title: str, found: Sequence[Mapping[str, Any]]) -> None:
 
 def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]

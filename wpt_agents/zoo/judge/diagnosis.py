@@ -20,10 +20,10 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.rssm import Latent
-from wpt_agents.zoo.collect.collect import record
-from wpt_agents.zoo.collect.trained import Trained
+from wpt_agents.zoo.collect.episodes import record
 from wpt_agents.zoo.judge.evaluation import acting
-from wpt_agents.zoo.run.stages import console
+from wpt_agents.zoo.judge.trained import Trained
+from wpt_agents.zoo.terminal import console
 
 SAMPLES = 16  # dreams from each state
 STARTS = 5  # states of an episode, evenly spaced

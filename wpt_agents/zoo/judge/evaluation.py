@@ -2,14 +2,12 @@
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import wpt_envs
-from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -17,72 +15,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act
-from wpt_agents.zoo.collect.collect import record
-from wpt_agents.zoo.run.progress import progress
-from wpt_agents.zoo.statistics import mean_interval
-
-Observation = np.ndarray | dict[str, np.ndarray]
-State = tuple[np.ndarray, ...]
-
-
-@dataclass(frozen=True)
-class DoNothing:
-    """The action zero."""
-
-    action_space: spaces.Box
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State | None]:
-        """Zeros, (n, A)."""
-        return np.zeros((len(observation), *self.action_space.shape), np.float32), None
-
-
-class RandomPolicy:
-    """Uniform in the action space."""
-
-    def __init__(self, action_space: spaces.Box, seed: int) -> None:
-        self.action_space, self.rng = action_space, np.random.default_rng(seed)
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State | None]:
-        """Uniform draws, (n, A), whatever `deterministic` says."""
-        low, high = self.action_space.low, self.action_space.high
-        return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
-
-
-@dataclass(frozen=True)
-class Score:
-    """The returns of one policy, and successes where the task reports them."""
-
-    returns: list[float]
-    successes: list[bool]
-
-    @property
-    def interval(self) -> tuple[float, float | None, float | None]:
-        """Mean return, and its 95 % interval."""
-        return mean_interval(self.returns)
-
-    def as_dict(self) -> dict[str, Any]:
-        """What `result.json` holds."""
-        mean, low, high = self.interval
-        rate = float(np.mean(self.successes)) if self.successes else None
-        return asdict(self) | {"mean": mean, "low": low, "high": high, "success_rate": rate}
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
-        """Reads back `as_dict`."""
-        return cls(given["returns"], given["successes"])
-
+from wpt_agents.zoo.collect.episodes import record
+from wpt_agents.zoo.judge.untrained import State
+from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.terminal import progress
 
 EPISODE = 2  # a purpose in a seed's derivation, beside `plan.EVALUATION`
 

@@ -16,7 +16,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch, Trajectory, led_to, stack_windows
 from wpt_agents.training.checks import check_images
-from wpt_agents.zoo.pictures.prediction_pictures import Curve, Strip, draw_curves, draw_strips
+from wpt_agents.zoo.pictures.predictions import Curve, Strip, draw_curves, draw_strips
 from wpt_agents.zoo.statistics import bootstrap
 
 CONTEXT, HORIZON = 5, 40  # images filtered, then images predicted

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from wpt_agents.files.names import counted
-from wpt_agents.zoo.plan.plan import METHODS, Run
+from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.folders import read_results
 
 STORED_STEP, RAW_STEP = 2_500, 12_288  # bytes of an image: in the dataset (lossless), in the replay

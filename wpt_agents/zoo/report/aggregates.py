@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import preset_folder
 from wpt_agents.zoo.statistics import (
     bootstrap,

@@ -18,7 +18,7 @@ import matplotlib
 import numpy as np
 
 from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.plan.plan import METHODS
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.tables import interval_text, markdown_table, number

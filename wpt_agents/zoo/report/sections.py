@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from wpt_envs.tasks import TASKS
 
-from wpt_agents.zoo.plan.plan import ABLATION
+from wpt_agents.zoo.plan.methods import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import (
     STATISTICS,

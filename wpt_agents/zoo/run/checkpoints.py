@@ -18,10 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.logger import CSVOutputFormat
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.callbacks import BaseCallback
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.replay import ReplayBuffer
@@ -176,51 +173,3 @@ class Checkpoints(BaseCallback):
         interrupted = self.model._last_obs is None  # by an error, in the middle of an episode
         if not interrupted and self.model.num_timesteps > self.written:
             write_checkpoint(self.model, self.run, self.seconds)
-
-
-class Evaluations(EvalCallback):
-    """SB3's EvalCallback that goes on with its folder's evaluations, and with the best of them."""
-
-    def _init_callback(self) -> None:
-        super()._init_callback()
-        path = Path(f"{self.log_path}.npz")
-        if path.exists():
-            with np.load(path) as held:
-                self.evaluations_timesteps = held["timesteps"].tolist()
-                self.evaluations_results = held["results"].tolist()
-                self.evaluations_length = held["ep_lengths"].tolist()
-                self.evaluations_successes = (
-                    held["successes"].tolist() if "successes" in held else []
-                )
-            self.best_mean_reward = float(np.mean(self.evaluations_results, 1).max())
-        self.n_calls = self.model.num_timesteps // self.model.n_envs
-
-    def _on_step(self) -> bool:
-        if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
-            done = len(self.evaluations_timesteps) * (self.n_eval_episodes + 1)
-            go_to_episode(self.eval_env, done)
-        return super()._on_step()
-
-
-def go_to_episode(venv: VecEnv, number: int) -> None:
-    """The next reset of environments under `EpisodeSeeds` begins episode `number`."""
-    venv.env_method("go_to_episode", number)
-
-
-class ContinuedCSV(CSVOutputFormat):
-    """SB3's `progress.csv`, which goes on with the rows that are there."""
-
-    def __init__(self, path: Path) -> None:
-        before = path.read_text() if path.exists() else ""
-        super().__init__(str(path))
-        self.file.write(before)
-        self.file.flush()
-        self.keys = before.partition("\n")[0].split(",") if before else []
-
-    def keep(self, rows: int) -> None:
-        """Drops all rows behind the first so many."""
-        self.file.seek(0)
-        lines = self.file.readlines()[: 1 + rows]
-        self.file.seek(0)
-        self.file.truncate()
-        self.file.writelines(lines)

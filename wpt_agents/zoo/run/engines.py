@@ -23,10 +23,12 @@ from rich.markup import escape
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.collect.workers import end_with_parent
 from wpt_agents.zoo.machine import check_machine, import_extra
-from wpt_agents.zoo.plan.plan import METHODS, Run
-from wpt_agents.zoo.run import benchmark
-from wpt_agents.zoo.run.stages import console, locked, say
+from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.run import runner
+from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.watch import shown
+from wpt_agents.zoo.terminal import console, say
 
 Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called again and again while waiting; takes a moment
@@ -60,25 +62,25 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     check_machine(engine, jobs[0].device)
     jobs = [_at_absolute_paths(job) for job in jobs]
     for job in jobs:
-        benchmark.check_folder(job, force)
-    runners: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
-    runner = runners[engine](given)
+        runner.check_folder(job, force)
+    engines: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
+    chosen = engines[engine](given)
     left = [job for job in jobs if force or job.result() is None]
     anew = [job.folder for job in left] if force else []
     with ExitStack() as held:
         for folder in anew:  # all of them, before anything is deleted
             held.enter_context(locked(folder / "lock"))
         for folder in anew:
-            benchmark.clear(folder)
+            runner.clear(folder)
     by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
     shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
     runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")
     say("engine", f"{engine}: {len(left)} of {runs} to do, {cpus} each")
     with shown(jobs) as tick:
-        if errors := runner.map(make_shared, list(shared.values()), tick):
+        if errors := chosen.map(make_shared, list(shared.values()), tick):
             reason = next(iter(errors.values()))
             raise ValueError(f"What the runs share could not be made: {reason}")
-        errors = runner.map(do, left, tick)
+        errors = chosen.map(do, left, tick)
     for folder, error in errors.items():
         console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")
     return all(job.result() for job in jobs)
@@ -100,7 +102,7 @@ def make_shared(job: Run) -> None:
 def do(job: Run) -> None:
     """A job's work: the run, from where it stands; what it says goes to its folder's `log.txt`."""
     with logged(job.folder / "log.txt"):
-        benchmark.run(job)
+        runner.run(job)
 
 
 @contextmanager
@@ -149,7 +151,7 @@ class Local:
     def start(self, work: Work, job: Run) -> BaseProcess:
         """A fresh process, so that no run inherits another's state."""
         context = get_context("forkserver")  # which imports once what each run needs
-        context.set_forkserver_preload([benchmark.__name__])
+        context.set_forkserver_preload([runner.__name__])
         process = context.Process(target=_in_child, args=(work, job, self.given.cpus))
         process.start()
         return process

@@ -11,10 +11,10 @@ import numpy as np
 from rich.live import Live
 from rich.table import Table
 
-from wpt_agents.zoo.plan.plan import Run
-from wpt_agents.zoo.plan.tasks import short_name
+from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.tables import number
-from wpt_agents.zoo.run.stages import console
+from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.terminal import console
 
 RECENT = 10  # episodes that return and speed are taken over
 

@@ -3,40 +3,37 @@
 They stand in `<out>/cache`, each named by a hash of all that it depends on.
 """
 
-import fcntl
 import hashlib
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from rich.console import Console
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
-from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted
 from wpt_agents.training.distributed import World
-from wpt_agents.zoo.collect.collect import collect
-from wpt_agents.zoo.judge.evaluation import DoNothing, RandomPolicy, Score, evaluate
+from wpt_agents.zoo.collect.collection import collect
+from wpt_agents.zoo.judge.evaluation import evaluate
+from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.plan.presets import Preset
-from wpt_agents.zoo.plan.tasks import find_tasks
-from wpt_agents.zoo.run.checkpoints import ContinuedCSV
+from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.run.locks import locked, write_json
+from wpt_agents.zoo.run.logs import ContinuedCSV
+from wpt_agents.zoo.tasks import find_tasks
+from wpt_agents.zoo.terminal import say
 
 Callback = Callable[[int, dict[str, float]], None]  # of pre-training
-PATIENCE = 0.5  # seconds with a lock that is held: `zoo watch` looks at each for an instant
 
-console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 # Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
 FINE_TUNING = {
@@ -55,49 +52,10 @@ FINE_TUNING = {
 }
 
 
-def say(stage: str, text: str) -> None:
-    """One line about a stage, above its progress bar."""
-    console.print(f"[bold]{stage:<10}[/bold]{text}")
-
-
 def key(*parts: Any) -> str:
     """A short hash of settings and of the library's version."""
     text = json.dumps([version("wpt-agents"), *parts], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
-
-
-@contextmanager
-def locked(path: Path, wait: bool = False) -> Iterator[None]:
-    """Keeps other processes out while the block runs; the lock ends with its process.
-
-    :param path: a file that stands for what is locked
-    :param wait: until it is free, instead of refusing after `PATIENCE`
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w") as file:
-        until = time.monotonic() + PATIENCE
-        while not _taken(file, wait):
-            if time.monotonic() > until:
-                raise ValueError(
-                    f"{path.parent} is being worked on by another process: wait for it, or use "
-                    "another --out"
-                )
-            time.sleep(PATIENCE / 10)
-        yield
-
-
-def _taken(file: IO[str], wait: bool) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        return False
-    return True
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes `value` to `path`, whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1))
 
 
 @dataclass(frozen=True)
@@ -246,12 +204,6 @@ class Shared:
         score = evaluate(policy, task.id, self.env, episodes, seed, name)
         write_json(path, score.as_dict())
         return score
-
-
-BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
-    "nothing": lambda space, seed: DoNothing(space),
-    "random": RandomPolicy,
-}
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def report(
     from wpt_agents.zoo.report import tables
     from wpt_agents.zoo.report.folders import find_finished, read_results
     from wpt_agents.zoo.report.page import write_page
-    from wpt_agents.zoo.run.stages import console
+    from wpt_agents.zoo.terminal import console
 
     if record is not None and record.suffix != ".csv":
         raise ValueError(f"--record {record}: a record is a .csv; its .md and .png stand beside it")

@@ -13,7 +13,7 @@ matplotlib.use("Agg")  # no display
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-from wpt_agents.zoo.judge.evaluation import Score
+from wpt_agents.zoo.result import Score
 
 INK, MUTED = "#1f2933", "#8a94a0"
 COLOURS = {"nothing": "#b0b7bf", "random": "#7f8a96", "prior actor": "#d98324", "WPT": "#2463a8"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from wpt_agents.zoo.collect.trained import find_trained
+from wpt_agents.zoo.judge.trained import find_trained
 from wpt_agents.zoo.machine import import_extra
 from wpt_agents.zoo.report import record, tables
 from wpt_agents.zoo.report.aggregates import score_of

@@ -3,57 +3,26 @@
 import json
 import shlex
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 from wpt_envs.rendering import QUALITIES
 from wpt_envs.tasks import Task
 
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.files.names import counted, unknown_name
+from wpt_agents.files.names import unknown_name
 from wpt_agents.training.checks import check_hyperparameters
 from wpt_agents.training.guidance import ever, parse_schedule
-from wpt_agents.zoo.collect.collect import BEHAVIOURS
+from wpt_agents.zoo.collect.collection import BEHAVIOURS
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import Preset, load_preset, wpt_keywords
-from wpt_agents.zoo.plan.tasks import find_tasks, short_name
-from wpt_agents.zoo.run.stages import Shared, console
+from wpt_agents.zoo.run.shared import Shared
+from wpt_agents.zoo.tasks import find_tasks, short_name
 
 EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
-
-
-@dataclass(frozen=True)
-class Method:
-    """Which of the paper's parts are on.
-
-    :param wpt: keywords of WPT that switch the others off
-    """
-
-    pretrained: bool = True
-    needs_data: bool = True
-    wpt: Mapping[str, Any] = field(default_factory=dict)
-
-
-ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
-METHODS = {
-    "wpt": Method(),
-    "kickstart": Method(wpt={"kickstart": 20.0}),
-    "scratch": Method(False, False, ALONE),
-    "pretrain-only": Method(wpt=ALONE),
-    "no-guidance": Method(wpt={"guidance": 0.0, "kickstart": 0.0}),
-    "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
-    "no-pretrain": Method(pretrained=False),
-    "random-retrieval": Method(wpt={"retrieval": "random"}),
-}
-ABLATION = {
-    "scratch": "none",
-    "pretrain-only": "P",
-    "no-guidance": "P+ER",
-    "wpt": "P+ER+G",
-}  # Fig. 5
 
 
 def this_command() -> str:
@@ -243,22 +212,3 @@ def check_width(job: Run, widths: Collection[int]) -> None:
             f"{whose} {widest} actions, the preset's max_action_dim is "
             f"{wpt['max_action_dim']}: --set max_action_dim={widest}"
         )
-
-
-def show_plan(jobs: Sequence[Run], force: bool) -> None:
-    """Prints what would be done, and what is there already."""
-    table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
-    for job in jobs:
-        state = "finished" if job.result() and not force else "to do"
-        numbers = f"{job.preset.steps:,}", f"{job.updates:,}"
-        names = short_name(job.task), job.method, str(job.seed)
-        table.add_row(*names, *numbers, state, str(job.folder))
-    console.print(table)
-    shared = {job.shared.model_path: job.shared for job in jobs if METHODS[job.method].needs_data}
-    for path, each in shared.items():
-        episodes = each.preset.collect.episodes * len(each.tasks)
-        state = "there" if each.data_path.exists() else f"{counted(episodes, 'episode')} to collect"
-        console.print(f"dataset      {state}  [dim]{each.data_path}")
-        done = (path / "done.json").exists()
-        state = "there" if done else f"{counted(each.preset.pretrain.steps, 'update')} to make"
-        console.print(f"world model  {state}  [dim]{path}")

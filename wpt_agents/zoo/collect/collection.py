@@ -8,21 +8,14 @@ Example::
 import json
 import os
 import shutil
-import warnings
 import zlib
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import closing
-from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-import wpt_envs
-from gymnasium import spaces
 from tqdm.auto import tqdm
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
@@ -31,118 +24,22 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import unknown_name
 from wpt_agents.training.checks import check_hyperparameters
-from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
 from wpt_agents.zoo.collect.curious import Expedition, explore_each
-from wpt_agents.zoo.collect.policies import SavedPolicy, load_policy, sees_states
+from wpt_agents.zoo.collect.episodes import (
+    SIGMAS,
+    Job,
+    Recipe,
+    has_script,
+    make_env,
+    play,
+    robot_of,
+)
+from wpt_agents.zoo.collect.policies import load_policy
 from wpt_agents.zoo.collect.workers import worker_pool
-from wpt_agents.zoo.run.progress import progress
+from wpt_agents.zoo.terminal import progress
 
 BEHAVIOURS = ("random", "noise", "scripted", "policy", *EXPLORERS)
-SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
-MAX_STEPS = 1000  # where an environment without a time limit is cut
 EPISODES_A_JOB = 4
-
-
-def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
-    """Plays one episode, cut after `max_steps`, and returns it with its rewards."""
-    obs, info = env.reset(seed=seed)
-    images, actions, rewards = [obs], list[np.ndarray](), list[float]()
-    terminated = truncated = False
-    while not (terminated or truncated or len(actions) == max_steps):
-        action = np.asarray(act(obs, info, len(actions)), np.float32)
-        obs, reward, terminated, truncated, info = env.step(action)
-        images.append(obs)
-        actions.append(action)
-        rewards.append(float(reward))
-    return Trajectory(
-        np.stack(images), np.stack(actions), np.array(rewards, np.float32), bool(terminated)
-    )
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How the episodes of a collection come about, apart from the task.
-
-    :param behaviour: one of `BEHAVIOURS`
-    :param env: keyword arguments of `gymnasium.make`
-    :param rewards: whether to keep the rewards
-    :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
-    :param policy: a saved policy, see `wpt_agents.zoo.collect.policies.load_policy`
-    :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
-    """
-
-    seed: int = 0
-    behaviour: str = "noise"
-    env: Mapping[str, Any] = field(default_factory=dict)
-    rewards: bool = False
-    sigmas: tuple[float, ...] = SIGMAS
-    policy: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def label(self) -> dict[str, Any]:
-        """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
-        always, default = ("seed", "behaviour", "env"), vars(Plan())
-        told = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
-        return json.loads(json.dumps(told))
-
-    def sigma(self, episode: int) -> float:
-        """The noise of an episode."""
-        return self.sigmas[episode % len(self.sigmas)]
-
-
-@dataclass(frozen=True)
-class Job:
-    """Consecutive episodes of one task, all that a worker needs to know of them."""
-
-    task: str
-    first: int
-    count: int
-    plan: Plan
-
-
-def play(job: Job) -> list[Trajectory]:
-    """The episodes of a job: a function of the job alone."""
-    with closing(make_env(job.task, job.plan)) as env, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
-        episodes = range(job.first, job.first + job.count)
-        return [_play_episode(env, job, episode) for episode in episodes]
-
-
-def make_env(task: str, plan: Plan) -> gym.Env:
-    """The task with actions in [-1, 1], telling its state to those who need it."""
-    told = plan.behaviour == "scripted" and _has_script(task)
-    told = told or (plan.policy is not None and sees_states(plan.policy))
-    env = gym.make(task, **plan.env, **({"state_in_info": True} if told else {}))
-    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
-        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    return env
-
-
-def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
-    plan, task = job.plan, zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
-    source = np.random.SeedSequence([plan.seed, task, episode])
-    assert env.action_space.shape is not None
-    act, name = _actions(
-        np.random.default_rng(source), job.task, plan, episode, env.action_space.shape[0]
-    )
-    played = record(env, act, int(source.generate_state(1)[0]))
-    reward = played.reward if plan.rewards else None
-    return replace(played, reward=reward, embodiment=_robot(job.task), task=job.task, source=name)
-
-
-def _actions(
-    rng: np.random.Generator, task: str, plan: Plan, episode: int, width: int
-) -> tuple[Act, str]:
-    if plan.behaviour == "policy":
-        assert plan.policy is not None
-        sigma = plan.sigma(episode)
-        name = f"policy {Path(plan.policy).name}, sigma {sigma}"
-        return SavedPolicy(rng, plan.policy, sigma, width), name
-    if plan.behaviour == "random":
-        return random_actions(rng, width, MAX_STEPS)
-    if plan.behaviour == "scripted" and _has_script(task):
-        return scripted_actions(rng, task, plan.sigma(episode))
-    return noise_actions(rng, width, MAX_STEPS)
 
 
 def collect(
@@ -180,10 +77,10 @@ def collect(
     """
     _check(tasks, episodes, behaviour, policy)
     check_hyperparameters({**EXPLORE, **(settings or {})})
-    plan = Plan(
+    recipe = Recipe(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
-    told = {"tasks": list(tasks), "episodes": episodes, **plan.label()}
+    told = {"tasks": list(tasks), "episodes": episodes, **recipe.label()}
     dataset, total = _open(Path(path), told), len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
@@ -198,7 +95,7 @@ def collect(
     with dataset:
         dataset.reserve()  # before what is missing is counted
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
-            gather(dataset, tasks, episodes, plan, workers, bar)
+            gather(dataset, tasks, episodes, recipe, workers, bar)
     return TrajectoryDataset.open(path)
 
 
@@ -206,12 +103,12 @@ def _collect_played(
     dataset: TrajectoryDataset,
     tasks: Sequence[str],
     episodes: int,
-    plan: Plan,
+    recipe: Recipe,
     workers: int,
     bar: "tqdm[None]",
 ) -> None:
     jobs = [
-        Job(task, first, min(EPISODES_A_JOB, episodes - first), plan)
+        Job(task, first, min(EPISODES_A_JOB, episodes - first), recipe)
         for at, task in enumerate(tasks)
         for first in range(_done(dataset, at, episodes), episodes, EPISODES_A_JOB)
     ]
@@ -226,7 +123,7 @@ def _collect_curious(
     dataset: TrajectoryDataset,
     tasks: Sequence[str],
     episodes: int,
-    plan: Plan,
+    recipe: Recipe,
     workers: int,
     bar: "tqdm[None]",
 ) -> None:
@@ -235,13 +132,13 @@ def _collect_curious(
         Expedition(
             task,
             episodes,
-            plan.seed,
-            plan.behaviour,
+            recipe.seed,
+            recipe.behaviour,
             dataset.path / f"exploring-{zlib.crc32(task.encode()):08x}",
-            partial(make_env, task, plan),
-            plan.settings,
-            _robot(task),
-            plan.rewards,
+            partial(make_env, task, recipe),
+            recipe.settings,
+            robot_of(task),
+            recipe.rewards,
         )
         for at, task in enumerate(tasks)
         if _done(dataset, at, episodes) < episodes
@@ -272,22 +169,12 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
         )
     if behaviour not in BEHAVIOURS:
         raise unknown_name("behaviour", behaviour, BEHAVIOURS)
-    if behaviour == "scripted" and not any(map(_has_script, tasks)):
+    if behaviour == "scripted" and not any(map(has_script, tasks)):
         raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
     if (behaviour == "policy") != (policy is not None):
         raise ValueError("The behaviour 'policy', and no other, wants policy=FILE (--policy FILE).")
     if policy is not None:
         load_policy(policy)  # says what is wrong with it
-
-
-def _robot(task: str) -> str | None:
-    row = wpt_envs.TASKS.get(task)
-    return row.embodiment if row else None
-
-
-def _has_script(task: str) -> bool:
-    row = wpt_envs.TASKS.get(task)
-    return row is not None and row.suite == "metaworld"
 
 
 def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:

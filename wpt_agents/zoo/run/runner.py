@@ -1,24 +1,17 @@
 """One (suite, task, seed, method) -> one run folder, with everything that was done and came out.
 
-A run collects, pre-trains, indexes, fine-tunes and evaluates; `wpt_agents.zoo.run.stages` holds
+A run collects, pre-trains, indexes, fine-tunes and evaluates; `wpt_agents.zoo.run.shared` holds
 what runs share. `result.json` is written last: where it stands, the run is finished.
 """
 
-import json
-import platform
-import shutil
-import subprocess
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import yaml
 from rich.markup import escape
 from stable_baselines3.common.callbacks import BaseCallback
@@ -30,27 +23,27 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted
-from wpt_agents.zoo.judge.evaluation import Score, episode_steps, evaluate, film, make_vec_env
-from wpt_agents.zoo.pictures import pictures, sheets
-from wpt_agents.zoo.plan.plan import METHODS, Run
-from wpt_agents.zoo.plan.presets import wpt_keywords
-from wpt_agents.zoo.plan.tasks import short_name
+from wpt_agents.zoo.judge.evaluation import episode_steps, evaluate, film, make_vec_env
+from wpt_agents.zoo.judge.untrained import BASELINES
+from wpt_agents.zoo.pictures import retrieval, runs
+from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.run.checkpoints import (
     LOGS,
     Checkpoint,
     Checkpoints,
-    ContinuedCSV,
-    Evaluations,
-    go_to_episode,
     last_checkpoint,
     remove_checkpoints,
 )
+from wpt_agents.zoo.run.folder import check_folder, clear
+from wpt_agents.zoo.run.locks import locked, write_json
+from wpt_agents.zoo.run.logs import ContinuedCSV, Evaluations, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
-from wpt_agents.zoo.run.stages import BASELINES, console, locked, say, write_json
-
-PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
-SIMULATORS = ("dm-control", "metaworld")
+from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.terminal import console, say
 
 
 def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
@@ -91,16 +84,6 @@ def run(job: Run, force: bool = False) -> dict[str, Any]:
         return _begin(job)
 
 
-def clear(folder: Path) -> None:
-    """Deletes what a run has left, all but its lock; first what says that it is finished."""
-    (folder / "result.json").unlink(missing_ok=True)
-    for path in folder.iterdir():
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.name != "lock":
-            path.unlink()
-
-
 def _begin(job: Run) -> dict[str, Any]:
     """Says in the folder what is being done, then does it."""
     (job.folder / "error.txt").unlink(missing_ok=True)
@@ -113,33 +96,6 @@ def _begin(job: Run) -> dict[str, Any]:
     except Exception:
         (job.folder / "error.txt").write_text(traceback.format_exc())
         raise
-
-
-def check_folder(job: Run, force: bool) -> None:
-    """Refuses to take a folder that is not this run's."""
-    path = job.folder / "config.yaml"
-    others = {each.name for each in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
-    if others and not path.exists():
-        raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
-    if path.exists() and not force:
-        usual = {f"wpt.{name}": value for name, value in wpt_keywords().items()}
-        before = usual | _flat(yaml.safe_load(path.read_text()))
-        wanted = usual | _flat(json.loads(json.dumps(job.config())))
-        differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
-        if differ:
-            raise ValueError(
-                f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
-                "use another --out, or --force to replace it"
-            )
-
-
-def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """{'wpt': {'gamma': 1}} -> {'wpt.gamma': 1}."""
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        sections = isinstance(value, dict)
-        flat |= {f"{name}.{k}": v for k, v in value.items()} if sections else {name: value}
-    return flat
 
 
 class Clock:
@@ -180,7 +136,7 @@ def _work(job: Run) -> dict[str, Any]:
                 job.shared.index(model)
                 if job.retrieves and model.retrieval == "nearest":
                     picture = job.folder / "retrieval.png"
-                    sheets.sheet_of_run(picture, model, job.task, job.shared.env, job.seed)
+                    retrieval.sheet_of_run(picture, model, job.task, job.shared.env, job.seed)
         clock.seconds["learn"] = round(_learn(job, model, checkpoint), 1)
         model.save(job.folder / "model.zip")
     with clock("evaluate"):
@@ -306,13 +262,13 @@ def _draw(job: Run, model: WPT, scores: Mapping[str, Score]) -> None:
         with np.load(path) as held:
             between = held["timesteps"] * repeat, held["results"]
     curve = job.folder / "learning_curve.png"
-    pictures.learning_curve(curve, title, frames, returns, scores, between)
+    runs.learning_curve(curve, title, frames, returns, scores, between)
     trajectory, shots, fps = film(model, job.task.id, job.shared.env, job.evaluation_seed)
-    pictures.video(job.folder / "policy.mp4", shots, fps)
+    runs.video(job.folder / "policy.mp4", shots, fps)
     context = 5
     predicted = model.open_loop(trajectory, context=context, horizon=40)
     true = trajectory.image[: len(predicted)]
-    pictures.prediction_strip(job.folder / "predictions.png", title, true, predicted, context)
+    runs.prediction_strip(job.folder / "predictions.png", title, true, predicted, context)
 
 
 def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) -> dict[str, Any]:
@@ -329,35 +285,4 @@ def _result(job: Run, scores: Mapping[str, Score], seconds: dict[str, float]) ->
         "scores": {name: score.as_dict() for name, score in scores.items()},
         "seconds": seconds,
         "commit": commit(),
-    }
-
-
-@cache
-def commit() -> str | None:
-    """The checkout's commit, '+' behind it when files differ; None outside a checkout.
-
-    Asked once, when the first run begins: the code that is at work does not change after that.
-    """
-    root = Path(__file__).parents[3]
-    if shutil.which("git") is None or not (root / ".git").exists():
-        return None
-    answer = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return answer.stdout.strip() or None
-
-
-def system() -> dict[str, Any]:
-    """The machine and the versions that a run was made with."""
-    return {
-        "commit": commit(),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "threads": torch.get_num_threads(),
-        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "versions": {name: version(name) for name in PACKAGES + SIMULATORS},
     }

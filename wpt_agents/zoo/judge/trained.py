@@ -10,11 +10,12 @@ from wpt_envs.tasks import TASKS
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
-from wpt_agents.zoo.judge.evaluation import Score, evaluate, film
+from wpt_agents.zoo.judge.evaluation import evaluate, film
 from wpt_agents.zoo.machine import check_device
-from wpt_agents.zoo.pictures import pictures
+from wpt_agents.zoo.pictures import runs
 from wpt_agents.zoo.plan.presets import EnvSettings
-from wpt_agents.zoo.plan.tasks import find_tasks
+from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.tasks import find_tasks
 
 POLICIES = ("wpt", "prior")
 
@@ -50,7 +51,7 @@ class Trained:
         """Films an episode to `path` (mp4) and gives its return."""
         trajectory, frames, fps = film(policy, self.task, self.env, seed, size)
         path.parent.mkdir(parents=True, exist_ok=True)
-        pictures.video(path, frames, fps)
+        runs.video(path, frames, fps)
         assert trajectory.reward is not None
         return float(trajectory.reward.sum())
 

@@ -1,0 +1,139 @@
+"""Playing the episodes of a collection: each one is a function of its task, recipe and number."""
+
+import json
+import warnings
+import zlib
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import wpt_envs
+from gymnasium import spaces
+
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
+from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
+
+SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
+
+
+MAX_STEPS = 1000  # where an environment without a time limit is cut
+
+
+def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
+    """Plays one episode, cut after `max_steps`, and returns it with its rewards."""
+    obs, info = env.reset(seed=seed)
+    images, actions, rewards = [obs], list[np.ndarray](), list[float]()
+    terminated = truncated = False
+    while not (terminated or truncated or len(actions) == max_steps):
+        action = np.asarray(act(obs, info, len(actions)), np.float32)
+        obs, reward, terminated, truncated, info = env.step(action)
+        images.append(obs)
+        actions.append(action)
+        rewards.append(float(reward))
+    return Trajectory(
+        np.stack(images), np.stack(actions), np.array(rewards, np.float32), bool(terminated)
+    )
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the episodes of a collection come about, apart from the task.
+
+    :param behaviour: one of `BEHAVIOURS`
+    :param env: keyword arguments of `gymnasium.make`
+    :param rewards: whether to keep the rewards
+    :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
+    :param policy: a saved policy, see `wpt_agents.zoo.collect.policies.load_policy`
+    :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
+    """
+
+    seed: int = 0
+    behaviour: str = "noise"
+    env: Mapping[str, Any] = field(default_factory=dict)
+    rewards: bool = False
+    sigmas: tuple[float, ...] = SIGMAS
+    policy: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def label(self) -> dict[str, Any]:
+        """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
+        always, default = ("seed", "behaviour", "env"), vars(Recipe())
+        told = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
+        return json.loads(json.dumps(told))
+
+    def sigma(self, episode: int) -> float:
+        """The noise of an episode."""
+        return self.sigmas[episode % len(self.sigmas)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Consecutive episodes of one task, all that a worker needs to know of them."""
+
+    task: str
+    first: int
+    count: int
+    recipe: Recipe
+
+
+def play(job: Job) -> list[Trajectory]:
+    """The episodes of a job: a function of the job alone."""
+    with closing(make_env(job.task, job.recipe)) as env, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
+        episodes = range(job.first, job.first + job.count)
+        return [_play_episode(env, job, episode) for episode in episodes]
+
+
+def make_env(task: str, recipe: Recipe) -> gym.Env:
+    """The task with actions in [-1, 1], telling its state to those who need it."""
+    told = recipe.behaviour == "scripted" and has_script(task)
+    told = told or (recipe.policy is not None and sees_states(recipe.policy))
+    env = gym.make(task, **recipe.env, **({"state_in_info": True} if told else {}))
+    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env
+
+
+def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
+    recipe = job.recipe
+    task = zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
+    source = np.random.SeedSequence([recipe.seed, task, episode])
+    assert env.action_space.shape is not None
+    act, name = _actions(
+        np.random.default_rng(source), job.task, recipe, episode, env.action_space.shape[0]
+    )
+    played = record(env, act, int(source.generate_state(1)[0]))
+    reward = played.reward if recipe.rewards else None
+    return replace(played, reward=reward, embodiment=robot_of(job.task), task=job.task, source=name)
+
+
+def _actions(
+    rng: np.random.Generator, task: str, recipe: Recipe, episode: int, width: int
+) -> tuple[Act, str]:
+    if recipe.behaviour == "policy":
+        assert recipe.policy is not None
+        sigma = recipe.sigma(episode)
+        name = f"policy {Path(recipe.policy).name}, sigma {sigma}"
+        return SavedPolicy(rng, recipe.policy, sigma, width), name
+    if recipe.behaviour == "random":
+        return random_actions(rng, width, MAX_STEPS)
+    if recipe.behaviour == "scripted" and has_script(task):
+        return scripted_actions(rng, task, recipe.sigma(episode))
+    return noise_actions(rng, width, MAX_STEPS)
+
+
+def robot_of(task: str) -> str | None:
+    """Return the name of the robot of a task, or None for an unknown task."""
+    row = wpt_envs.TASKS.get(task)
+    return row.embodiment if row else None
+
+
+def has_script(task: str) -> bool:
+    """Return whether Meta-World has a scripted policy for the task."""
+    row = wpt_envs.TASKS.get(task)
+    return row is not None and row.suite == "metaworld"

@@ -1,0 +1,142 @@
+"""The commands for a trained model: eval, enjoy, diagnose, open-loop, push, pull."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wpt_agents.zoo.commands.options import Device, print_table
+
+RunFolder = Annotated[
+    Path, typer.Argument(help="A run folder, moved or pulled too, or a model file (.zip).")
+]
+
+
+ForTask = Annotated[
+    str, typer.Option(help="`dmc-walker-run`; only for a model file without its run folder.")
+]
+
+
+Policy = Annotated[str, typer.Option(help="wpt, or prior: the actor that guided it.")]
+
+
+def evaluate_model(
+    run: RunFolder,
+    task: ForTask = "",
+    policy: Policy = "wpt",
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    device: Device = "auto",
+) -> None:
+    """Plays a trained model on its task and shows its returns. Needs no dataset.
+
+    Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
+    """
+    from wpt_agents.zoo.judge.trained import find_trained
+    from wpt_agents.zoo.report.tables import interval_text, number
+
+    trained = find_trained(run, task)
+    score = trained.evaluate(trained.load(policy, device), episodes, seed)
+    mean, low, high = score.interval
+    typer.echo(f"task             {trained.task}")
+    typer.echo(f"mean return      {number(mean)}")
+    typer.echo(f"95 % interval    {interval_text(low, high)}")
+    typer.echo(f"returns          {', '.join(map(number, score.returns))}")
+    if score.successes:
+        typer.echo(f"success          {score.as_dict()['success_rate']:.2f}, at the last step")
+
+
+def enjoy_model(
+    run: RunFolder,
+    task: ForTask = "",
+    policy: Policy = "wpt",
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial state.")] = 10_000,
+    out: Annotated[Path, typer.Option(help="The video.")] = Path("enjoy.mp4"),
+    size: Annotated[int, typer.Option(min=64, help="Its width; a multiple of 16.")] = 256,
+    device: Device = "auto",
+) -> None:
+    """Films an episode of a trained model to an mp4, which any browser plays.
+
+    Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
+    """
+    from wpt_agents.zoo.judge.trained import find_trained
+    from wpt_agents.zoo.report.tables import number
+
+    if size % 16:
+        raise ValueError(f"--size {size}: a video's width must be a multiple of 16.")
+    trained = find_trained(run, task)
+    total = trained.record(trained.load(policy, device), out, seed, size)
+    typer.echo(f"Return {number(total)}. Video: {out.resolve()}")
+
+
+def diagnose_model(
+    run: RunFolder,
+    task: ForTask = "",
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 5,
+    horizon: Annotated[int, typer.Option(min=1, help="Steps to dream.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    device: Device = "auto",
+) -> None:
+    """Shows why a policy earns what it earns: what its world model promises, and what comes.
+
+    Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
+    """
+    from wpt_agents.zoo.judge.diagnosis import diagnose, show
+    from wpt_agents.zoo.judge.trained import find_trained
+
+    show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
+
+
+def judge_predictions(
+    model: Annotated[
+        Path, typer.Argument(help="A model file, or a run's or pre-training's folder.")
+    ],
+    data: Annotated[Path, typer.Argument(help="A dataset that it was not trained on.")],
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Of each robot, at most, spread evenly.")
+    ] = 8,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write `prediction.csv` and pictures into.")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Shows how well a world model predicts: its error by horizon, beside the simplest guesses.
+
+    Example: `python -m wpt_agents.zoo open-loop walker.zip data/held-out --out predictions`
+    """
+    from wpt_agents.agents.wpt import WPT
+    from wpt_agents.data.dataset import TrajectoryDataset
+    from wpt_agents.zoo.judge.prediction import judge
+
+    file = model / "model.zip" if model.is_dir() else model
+    rows = judge(WPT.load(file, device=device), TrajectoryDataset.open(data), episodes, out)
+    print_table("Squared error of an image, as in Eq. (1)", list(rows))
+    if out is not None:
+        typer.echo(f"Pictures: {out.resolve()}")
+
+
+def push_run(
+    run: Annotated[Path, typer.Argument(help="A finished run's folder.")],
+    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
+    private: Annotated[bool, typer.Option(help="Only you can see it.")] = False,
+) -> None:
+    """Uploads a run to the Hugging Face hub: model, configuration, scores, video and a card.
+
+    Log in first: `hf auth login`.
+    """
+    from wpt_agents.zoo.report.hub import push
+
+    typer.echo(f"Pushed: {push(run, name, private)}")
+
+
+def pull_run(
+    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
+    out: Annotated[Path | None, typer.Option(help="A new folder. None: the repository's name.")] = (
+        None
+    ),
+) -> None:
+    """Downloads a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`."""
+    from wpt_agents.zoo.report.hub import pull
+
+    folder = pull(name, out or Path(name.rpartition("/")[2]))
+    typer.echo(f"Pulled: {folder.resolve()}. Watch it: python -m wpt_agents.zoo enjoy {folder}")

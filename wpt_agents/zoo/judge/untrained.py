@@ -1,0 +1,54 @@
+"""The policies that learn nothing: the zero action and uniformly random actions."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+Observation = np.ndarray | dict[str, np.ndarray]
+
+
+State = tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True)
+class DoNothing:
+    """The action zero."""
+
+    action_space: spaces.Box
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State | None]:
+        """Zeros, (n, A)."""
+        return np.zeros((len(observation), *self.action_space.shape), np.float32), None
+
+
+class RandomPolicy:
+    """Uniform in the action space."""
+
+    def __init__(self, action_space: spaces.Box, seed: int) -> None:
+        self.action_space, self.rng = action_space, np.random.default_rng(seed)
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State | None]:
+        """Uniform draws, (n, A), whatever `deterministic` says."""
+        low, high = self.action_space.low, self.action_space.high
+        return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
+
+
+BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
+    "nothing": lambda space, seed: DoNothing(space),
+    "random": RandomPolicy,
+}

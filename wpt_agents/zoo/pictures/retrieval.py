@@ -1,0 +1,104 @@
+"""A picture of what retrieval finds: query images beside their nearest trajectories."""
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from wpt_envs.tasks import Task
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.pictures.runs import COLOURS, INK, plt
+from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, kind
+
+
+class Query(NamedTuple):
+    """A first image to search for, and what is known of it."""
+
+    name: str
+    image: np.ndarray  # (64, 64, 3) uint8
+    embodiment: str | None
+    action_dim: int
+    own: int | None = None  # its number in the dataset, if it is from there
+
+
+class Found(NamedTuple):
+    """A query and the trajectories that begin most like it, nearest first."""
+
+    query: Query
+    indices: np.ndarray  # (k,)
+    distances: np.ndarray  # (k,)
+
+
+def query_of(dataset: TrajectoryDataset, i: int) -> Query:
+    """The first image of trajectory `i`."""
+    if not 0 <= i < len(dataset):
+        raise ValueError(f"No trajectory {i}: {dataset.path} holds {len(dataset)}, from 0 on")
+    trajectory = dataset[i]
+    name = f"#{i}\n{kind(trajectory.task, trajectory.embodiment)}"
+    return Query(name, trajectory.image[0], trajectory.embodiment, trajectory.action_dim, i)
+
+
+def query_at(task: Task, env: Mapping[str, Any], seed: int = 0) -> Query:
+    """The first image of a task, as fine-tuning by this seed searches for it.
+
+    :param env: keyword arguments of `gymnasium.make`
+    """
+    with closing(gym.make(task.id, **env)) as made:
+        image, _ = made.reset(seed=seed)
+    return Query(f"first image of\n{cut(task.name, 18)}", image, task.embodiment, task.action_dim)
+
+
+def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
+    """The nearest by Eq. (5), the query's own trajectory left out.
+
+    :param own_robot: only what `WPT.learn` would retrieve, by robot and action width
+    """
+    assert model.dataset is not None
+    robot = query.embodiment if query.embodiment in model.dataset.embodiments else None
+    known = (robot, query.action_dim) if own_robot else (None, None)
+    feature = model.policy.embed(query.image[None])[0]
+    indices, distances = model.build_index().search(feature, number + 1, *known)
+    others = indices != (-1 if query.own is None else query.own)
+    return Found(query, indices[others][:number], distances[others][:number])
+
+
+def retrieval_sheet(
+    path: str | os.PathLike[str], dataset: TrajectoryDataset, found: Sequence[Found]
+) -> None:
+    """Draws each query beside the first images of what was found, its own robot's framed blue."""
+    columns = max(len(each.indices) for each in found) + 1
+    figure, axes = plt.subplots(
+        len(found), columns, figsize=(columns * 1.25, len(found) * 1.62 + 0.5), squeeze=False
+    )
+    for row, (query, indices, distances) in zip(axes, found, strict=True):
+        draw(row[0], query.image, INK, 2.5)
+        row[0].set_title(query.name, fontsize=7, color=INK, fontweight="bold", pad=3)
+        for axis in row[1 + len(indices) :]:
+            axis.axis("off")
+        for axis, i, distance in zip(row[1:], indices, distances, strict=False):
+            robot, task = dataset.embodiments[i], dataset.tasks[i]
+            same = query.embodiment is not None and robot == query.embodiment
+            first = next(dataset.subset([i]).first_observations())[0]
+            draw(axis, first, COLOURS["WPT"] if same else COLOURS["prior actor"], 2)
+            axis.set_title(
+                f"#{i}  d {distance:.3g}\n{kind(task, robot)}", fontsize=6.5, color=INK, pad=3
+            )
+    robots = "blue: the query's own robot, orange: another"
+    finish(figure, path, f"First images and the nearest in {dataset.path.name} ({robots})")
+
+
+def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], seed: int) -> None:
+    """Draws what a run begins by retrieving, and below it the nearest of all robots."""
+    assert model.dataset is not None
+    query = query_at(task, env, seed)
+    rows = {"retrieved for\n": True, "nearest of all\n": False}
+    found = [
+        search(model, query._replace(name=f"{name}{cut(task.name, 18)}"), COLUMNS, own_robot)
+        for name, own_robot in rows.items()
+    ]
+    retrieval_sheet(path, model.dataset, found)

@@ -1,0 +1,47 @@
+"""Where a result comes from: the commit, the machine, and the versions of the packages."""
+
+import platform
+import shutil
+import subprocess
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
+
+
+SIMULATORS = ("dm-control", "metaworld")
+
+
+@cache
+def commit() -> str | None:
+    """The checkout's commit, '+' behind it when files differ; None outside a checkout.
+
+    Asked once, when the first run begins: the code that is at work does not change after that.
+    """
+    root = Path(__file__).parents[3]
+    if shutil.which("git") is None or not (root / ".git").exists():
+        return None
+    answer = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return answer.stdout.strip() or None
+
+
+def system() -> dict[str, Any]:
+    """The machine and the versions that a run was made with."""
+    return {
+        "commit": commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": torch.get_num_threads(),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": {name: version(name) for name in PACKAGES + SIMULATORS},
+    }

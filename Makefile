@@ -1,7 +1,15 @@
 # Three commands on a bare machine (Python 3.11+, git, a shell):
-#   make demo    installs, then runs the whole method on one task in minutes
-#   make test    installs, then runs the tests
-#   make learn   the test that learns from scratch, three seeds of some minutes each
+#   make demo       installs, then runs the whole method on one task in minutes
+#   make test       installs, then runs the tests
+#   make learn      the test that learns from scratch, three seeds of some minutes each
+# For contributors:
+#   make check      lint, types and the fast tests, in about three minutes
+#   make format     formats the code and applies automatic fixes
+#   make lint       ruff, codespell and mypy
+#   make types      mypy alone
+#   make nightly    notebooks, browser, packaging and other long checks
+#   make docs       the documentation site, with warnings as errors
+#   make linkcheck  looks up every link of the documentation (needs the network)
 # They make .venv when it is not there. Nothing outside this folder is written.
 
 PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13,$(if $(shell $(p) -c "import sys; print(sys.version_info >= (3, 11) or '')" 2>/dev/null),$(p))))
@@ -19,7 +27,7 @@ TORCH_ARGS ?=
 DEMO_ARGS ?=
 TEST_ARGS ?=
 
-.PHONY: help demo test learn lint install rendering clean
+.PHONY: help demo test learn lint install rendering clean format types check nightly docs linkcheck
 
 help:
 	@sed -n "s/^#   \(make [a-z]*  \)/  \1/p" Makefile
@@ -54,14 +62,38 @@ demo: rendering
 	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo $(DEMO_ARGS)
 
 test: rendering
-	@echo "[test] pytest $(TEST_ARGS)"
-	@$(BIN)/python -m pytest $(TEST_ARGS)
+	@echo "[test] pytest -m 'not nightly' $(TEST_ARGS)"
+	@$(BIN)/python -m pytest -m "not nightly" $(TEST_ARGS)
 
 learn: $(INSTALLED)
 	@$(BIN)/python -m pytest tests/test_learning.py --seeds 3 -v --durations 3
 
 lint: $(INSTALLED)
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy wpt_agents envs
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/codespell && $(BIN)/mypy wpt_agents envs
+
+types: $(INSTALLED)
+	@$(BIN)/mypy wpt_agents envs
+
+format: $(INSTALLED)
+	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
+
+check: lint rendering
+	@$(BIN)/python -m pytest -m "not slow and not nightly" $(TEST_ARGS)
+
+nightly: rendering $(VENV)/.docs
+	@$(BIN)/python -m pytest -m nightly -v -rs $(TEST_ARGS)
+
+# The documentation needs packages of its own: the extra `docs`.
+$(VENV)/.docs: $(INSTALLED)
+	@echo "[docs] the packages of the documentation"
+	@$(PIP) install -qq -e ".[docs]" && touch $@
+
+docs: $(VENV)/.docs
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "[docs] docs/_build/html/index.html"
+
+linkcheck: $(VENV)/.docs
+	@$(BIN)/python -m sphinx -W --keep-going -q -b linkcheck docs docs/_build/linkcheck
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache docs/_build

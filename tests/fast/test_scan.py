@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -5,16 +7,16 @@ from wpt_agents.model.networks import SIZES
 from wpt_agents.model.rssm import RSSM, Latent
 
 A, E, B, T = 3, 10, 4, 7
+SIZE = SIZES["debug"]
 
 
 def noise(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def ways(unimix):
+def ways(unimix, size=SIZE):
     """An RSSM, and what both ways through it take."""
     torch.manual_seed(0)
-    size = SIZES["debug"]
     rssm = RSSM(size, A, E, unimix)
     is_first = torch.zeros(B, T, dtype=torch.bool)
     is_first[:, 0] = is_first[1, 3] = is_first[2, 6] = True
@@ -46,9 +48,12 @@ def outcome(way, rssm, leaves, is_first):
     return outputs, dict(zip(wanted, first, strict=True)), dict(zip(wanted, second, strict=True))
 
 
-@pytest.mark.parametrize("unimix", [0.0, 0.01])
-def test_the_scan_by_hand_is_the_loop_with_its_gradients(unimix):
-    rssm, leaves, is_first = ways(unimix)
+@pytest.mark.parametrize(
+    ("unimix", "size"),
+    [(0.0, SIZE), (0.01, SIZE), (0.01, replace(SIZE, gates="across", norm_eps=0.3))],
+)
+def test_the_scan_by_hand_is_the_loop_with_its_gradients(unimix, size):
+    rssm, leaves, is_first = ways(unimix, size)
     plain, plain_gradients, _ = outcome(rssm._filter, rssm, leaves, is_first)
     fast, gradients, again = outcome(rssm._scan, rssm, leaves, is_first)
     assert torch.equal(fast[1].argmax(-1), plain[1].argmax(-1))  # the same draws

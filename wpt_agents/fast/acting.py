@@ -13,8 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
+from wpt_agents.fast.scan import split_in_blocks
 from wpt_agents.model.actor_critic import Actor
-from wpt_agents.model.networks import NORM_EPS, Encoder
+from wpt_agents.model.networks import Encoder, split_gates
 from wpt_agents.model.rssm import RSSM, Latent
 
 PATCHES = 256  # of several images; up to so many, a convolution is quicker as a matrix product
@@ -35,7 +36,7 @@ class Layer(NamedTuple):
 
 def norm_silu(x: Tensor, norm: nn.LayerNorm) -> Tensor:
     """SiLU(LayerNorm(x)) over the last axis."""
-    x = torch.layer_norm(x, norm.normalized_shape, norm.weight, norm.bias, NORM_EPS, False)
+    x = torch.layer_norm(x, norm.normalized_shape, norm.weight, norm.bias, norm.eps, False)
     return F.silu(x, inplace=True)
 
 
@@ -127,7 +128,8 @@ class FastFilter:
         self.shared = gru.shared_weight().t().contiguous().t()
         self.hidden_bias, self.own = gru.hidden.bias, gru.hidden.weight[:, :width]
         self.norm, self.gates = gru.norm, gru.gates.weight
-        gates_bias = gru.gates.bias.view(gru.blocks, 3, -1) - torch.tensor([[0.0], [0.0], [1.0]])
+        self.layout, gates_bias = gru.layout, gru.gates.bias.detach().clone()
+        split_gates(gates_bias[None], gru.blocks, gru.layout)[2].sub_(1)  # of the update gate
         self.gates_bias = gates_bias.view(gru.blocks, 1, -1)
         from_deter, from_embed = rssm.post_in.weight.split(
             [size.deter, rssm.post_in.in_features - size.deter], 1
@@ -168,7 +170,7 @@ class FastFilter:
         hidden = torch.baddbmm(in_blocks(shared, blocks), own, self.own)
         hidden = norm_silu(hidden.transpose(0, 1).reshape(n, -1), self.norm)
         gates = torch.baddbmm(self.gates_bias, in_blocks(hidden, blocks), self.gates)
-        reset, candidate, update = gates.chunk(3, -1)
+        reset, candidate, update = split_in_blocks(gates, self.layout)
         candidate = torch.sigmoid(reset).mul_(candidate).tanh_()
         return own.lerp(candidate, torch.sigmoid(update)).transpose(0, 1).reshape(n, -1)
 

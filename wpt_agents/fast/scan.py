@@ -7,16 +7,23 @@ layers saw and the slopes at their outputs are kept, and each weight gets its gr
 from one matmul over all steps.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
 from wpt_agents.model.distributions import exponential
-from wpt_agents.model.networks import NORM_EPS
 
 aten = torch.ops.aten
+
+
+class Constants(NamedTuple):
+    """What a scan needs to know besides its weights; see `Size`."""
+
+    unimix: float
+    gates: str
+    norm_eps: float
 
 
 class Tape:
@@ -87,14 +94,14 @@ class Blocks(Tape):
 class NormSiLU(Tape):
     """SiLU(LayerNorm(x)): (N, width) -> (N, width)."""
 
-    def __init__(self, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, weight: Tensor, bias: Tensor, eps: float) -> None:
         super().__init__()
-        self.weight, self.bias = weight, bias
+        self.weight, self.bias, self.eps = weight, bias, eps
 
     def forward(self, x: Tensor) -> Tensor:
         """One step."""
         normed, *moments = aten.native_layer_norm(
-            x, self.weight.shape, self.weight, self.bias, NORM_EPS
+            x, self.weight.shape, self.weight, self.bias, self.eps
         )
         self.seen.append((x, normed, *moments))
         return aten.silu(normed)
@@ -120,11 +127,18 @@ class NormSiLU(Tape):
 
 
 class Gates(Tape):
-    """The GRU's gates, blocks in front: (b, N, 3, D / b) and h (b, N, D / b) -> the next h."""
+    """The GRU's gates, blocks in front: (b, N, 3 D / b) and h (b, N, D / b) -> the next h.
+
+    :param layout: `Size.gates`
+    """
+
+    def __init__(self, layout: str) -> None:
+        super().__init__()
+        self.layout = layout
 
     def forward(self, gates: Tensor, deter: Tensor) -> Tensor:
         """One step."""
-        reset, candidate, update = gates.unbind(2)
+        reset, candidate, update = split_in_blocks(gates, self.layout)
         reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)
         new = torch.tanh(reset * candidate)
         self.seen.append((reset, candidate, update, new, deter))
@@ -137,21 +151,36 @@ class Gates(Tape):
         to_update = aten.sigmoid_backward(slope * (new - deter), update)
         to_product = aten.tanh_backward(to_new, new)
         to_reset = aten.sigmoid_backward(to_product * candidate, reset)
-        return torch.stack([to_reset, to_product * reset, to_update], 2), slope - to_new
+        return self._joined(to_reset, to_product * reset, to_update), slope - to_new
+
+    def _joined(self, *gates: Tensor) -> Tensor:
+        """The inverse of `split_in_blocks`."""
+        if self.layout == "within":
+            return torch.cat(gates, 2)
+        flat = torch.stack(gates).permute(2, 0, 1, 3).flatten(1)  # (N, 3 D)
+        return flat.unflatten(1, (len(gates[0]), -1)).transpose(0, 1)
+
+
+def split_in_blocks(gates: Tensor, layout: str) -> tuple[Tensor, ...]:
+    """`split_gates` with the blocks in front: (b, N, 3 D / b) -> three times (b, N, D / b)."""
+    if layout == "within":
+        return gates.chunk(3, 2)
+    flat = gates.transpose(0, 1).flatten(1)  # (N, 3 D), the thirds of which are the gates
+    return flat.unflatten(1, (3, len(gates), -1)).permute(1, 2, 0, 3).unbind(0)
 
 
 class Steps:
     """All layers of a step, made of the weights in the order of `RSSM._scan`."""
 
-    def __init__(self, unimix: float, weights: tuple[Tensor, ...]) -> None:
-        w = iter(weights)
-        self.deter_in, self.deter_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w))
-        self.stoch_in, self.stoch_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w))
+    def __init__(self, constants: Constants, weights: tuple[Tensor, ...]) -> None:
+        w, eps = iter(weights), constants.norm_eps
+        self.deter_in, self.deter_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w), eps)
+        self.stoch_in, self.stoch_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w), eps)
         self.shared, self.own = Linear(next(w)), Blocks(next(w))
-        self.norm, self.gates_in = NormSiLU(next(w), next(w)), Blocks(next(w), next(w))
+        self.norm, self.gates_in = NormSiLU(next(w), next(w), eps), Blocks(next(w), next(w))
         self.post_in = Linear(next(w))
-        self.post_norm, self.post_out = NormSiLU(next(w), next(w)), Linear(next(w), next(w))
-        self.gates, self.unimix = Gates(), unimix
+        self.post_norm, self.post_out = NormSiLU(next(w), next(w), eps), Linear(next(w), next(w))
+        self.gates, self.unimix = Gates(constants.gates), constants.unimix
         self.probs: list[Tensor] = []
         self.mixed: list[Tensor] = []
 
@@ -175,7 +204,6 @@ class Steps:
         own = self.own.forward(in_blocks).transpose(0, 1)
         hidden = self.norm.forward(own.add(shared.view(own.shape)).flatten(1))
         gates = self.gates_in.forward(hidden.unflatten(1, (blocks, -1)).transpose(0, 1))
-        gates = gates.unflatten(2, (3, -1))
         deter = self.gates.forward(gates, in_blocks).transpose(0, 1).flatten(1)
         hidden = self.post_norm.forward(self.post_in.forward(deter, embed_half))
         probs = self.post_out.forward(hidden).view(stoch.shape).softmax(-1)
@@ -197,7 +225,7 @@ class Steps:
         to_deter = self.post_in.backward(to_post, to_deter)
         slope = to_deter.unflatten(1, (blocks, -1)).transpose(0, 1)
         to_gates, through = self.gates.backward(t, slope)
-        to_hidden = self.gates_in.backward(to_gates.flatten(2)).transpose(0, 1).flatten(1)
+        to_hidden = self.gates_in.backward(to_gates).transpose(0, 1).flatten(1)
         to_sum = self.norm.backward(t, to_hidden)
         to_own = self.own.backward(to_sum.unflatten(1, (blocks, -1)).transpose(0, 1))
         to_shared = self.shared.backward(to_sum)
@@ -214,7 +242,7 @@ class FilterScan(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        unimix: float,
+        constants: Constants,
         generator: Generator | None,
         is_first: Tensor,
         action_half: Tensor,
@@ -232,7 +260,7 @@ class FilterScan(torch.autograd.Function):
         :param stoch: (B, S, K)
         :param weights: in the order that `Steps` takes them
         """
-        steps = Steps(unimix, weights)
+        steps = Steps(constants, weights)
         keep = (~is_first).to(deter.dtype)
         resets = is_first.any(1).tolist()
         deters, stochs = [], []

@@ -46,6 +46,10 @@ class Size:
     :param learning_rate: of world model and reward head
     :param actor_critic_learning_rate: of actor and critic
     :param stabilised: DreamerV3's zero-initialised heads and normalised returns
+    :param blocks: blocks of the block-diagonal layers
+    :param gates: how the GRU's last layer orders its gates: "within" each block, as DreamerV3, or
+        "across" the blocks, as the weights that the paper's authors publish
+    :param norm_eps: eps of every layer norm but those over a convolution's channels (1e-3)
     """
 
     deter: int
@@ -58,6 +62,8 @@ class Size:
     actor_critic_learning_rate: float = 8e-5
     stabilised: bool = True
     blocks: int = 8
+    gates: str = "within"
+    norm_eps: float = NORM_EPS
 
 
 # `paper`: Table 2 prints 12288 as hidden and 1536 as deterministic; only the other way round does
@@ -69,6 +75,16 @@ SIZES = {
     "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
     "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5, stabilised=False),
 }
+
+
+def split_gates(gates: Tensor, blocks: int, layout: str) -> tuple[Tensor, ...]:
+    """Reset, candidate and update of a GRU, each (N, b, D / b), of its last layer's (N, 3 D).
+
+    :param layout: `Size.gates`; "across" gives a unit the gates that other blocks computed
+    """
+    if layout == "within":
+        return gates.unflatten(1, (blocks, 3, -1)).unbind(2)
+    return gates.unflatten(1, (3, blocks, -1)).unbind(1)
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -166,8 +182,8 @@ class BlockLinear(nn.Module):
 class LinearNorm(nn.Sequential):
     """Linear, layer norm, SiLU."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(Linear(inputs, outputs), nn.LayerNorm(outputs, eps=NORM_EPS), nn.SiLU())
+    def __init__(self, inputs: int, outputs: int, eps: float = NORM_EPS) -> None:
+        super().__init__(Linear(inputs, outputs), nn.LayerNorm(outputs, eps=eps), nn.SiLU())
 
 
 class DownConv(nn.Conv2d):
@@ -334,12 +350,12 @@ class Decoder(nn.Module):
         width, code, depth = 2 * size.hidden, 32 * size.depth, size.depth
         self.from_deter = nn.Sequential(
             BlockLinear(size.deter, width, size.blocks),
-            nn.LayerNorm(width, eps=NORM_EPS),
+            nn.LayerNorm(width, eps=size.norm_eps),
             nn.SiLU(),
             Linear(width, code),
         )
         self.from_stoch = nn.Sequential(
-            LinearNorm(size.stoch * size.classes, width), Linear(width, code)
+            LinearNorm(size.stoch * size.classes, width, size.norm_eps), Linear(width, code)
         )
         self.layers = nn.Sequential(
             FromPixel(code, 4 * depth, 5),
@@ -383,12 +399,12 @@ class Head(nn.Module):
         width = 2 * size.units
         self.from_deter = nn.Sequential(
             BlockLinear(size.deter, width, size.blocks),
-            nn.LayerNorm(width, eps=NORM_EPS),
+            nn.LayerNorm(width, eps=size.norm_eps),
             nn.SiLU(),
             Linear(width, size.units),
         )
         self.from_stoch = Linear(size.stoch * size.classes, size.units)
-        hidden = [LinearNorm(size.units, size.units) for _ in range(layers)]
+        hidden = [LinearNorm(size.units, size.units, size.norm_eps) for _ in range(layers)]
         last = Linear(size.units, outputs)
         self.layers = nn.Sequential(*hidden, last)
         self.deter_dim, self.units = size.deter, size.units

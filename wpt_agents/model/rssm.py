@@ -7,16 +7,16 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
-from wpt_agents.fast.scan import FilterScan
+from wpt_agents.fast.scan import Constants, FilterScan
 from wpt_agents.model.distributions import Noise, mode_one_hot, sample_one_hot, unimix_logits
 from wpt_agents.model.networks import (
-    NORM_EPS,
     BlockLinear,
     Linear,
     LinearNorm,
     Size,
     block_linear,
     linear,
+    split_gates,
 )
 
 
@@ -54,11 +54,12 @@ class BlockGRU(nn.Module):
     def __init__(self, size: Size, action_dim: int) -> None:
         super().__init__()
         deter, hidden, self.blocks = size.deter, size.hidden, size.blocks
-        self.from_deter = LinearNorm(deter, hidden)
-        self.from_stoch = LinearNorm(size.stoch * size.classes, hidden)
-        self.from_action = LinearNorm(action_dim, hidden)
+        self.layout, eps = size.gates, size.norm_eps
+        self.from_deter = LinearNorm(deter, hidden, eps)
+        self.from_stoch = LinearNorm(size.stoch * size.classes, hidden, eps)
+        self.from_action = LinearNorm(action_dim, hidden, eps)
         self.hidden = BlockLinear(deter + 3 * hidden * self.blocks, deter, self.blocks)
-        self.norm = nn.LayerNorm(deter, eps=NORM_EPS)
+        self.norm = nn.LayerNorm(deter, eps=eps)
         self.gates = BlockLinear(deter, 3 * deter, self.blocks)
 
     def shared_weight(self) -> Tensor:
@@ -84,9 +85,7 @@ class BlockGRU(nn.Module):
             weight = self.hidden.weight[:, : own.shape[-1]]
             hidden = linear(inputs, shared.t(), self.hidden.bias) + block_linear(deter, weight)
         hidden = F.silu(self.norm(hidden))
-        # the three gates of a unit stand in the unit's own block
-        gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1))
-        reset, candidate, update = gates.unbind(2)
+        reset, candidate, update = split_gates(self.gates(hidden), self.blocks, self.layout)
         update = torch.sigmoid(update - 1)  # starts out remembering
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return (update * candidate + (1 - update) * own).flatten(1)
@@ -107,13 +106,13 @@ class RSSM(nn.Module):
         code = size.stoch * size.classes
         self.gru = BlockGRU(size, action_dim)
         self.prior_net = nn.Sequential(
-            LinearNorm(size.deter, size.hidden),
-            LinearNorm(size.hidden, size.hidden),
+            LinearNorm(size.deter, size.hidden, size.norm_eps),
+            LinearNorm(size.hidden, size.hidden, size.norm_eps),
             Linear(size.hidden, code),
         )
         self.post_in = Linear(size.deter + embed_dim, size.hidden)
         self.post_out = nn.Sequential(
-            nn.LayerNorm(size.hidden, eps=NORM_EPS), nn.SiLU(), Linear(size.hidden, code)
+            nn.LayerNorm(size.hidden, eps=size.norm_eps), nn.SiLU(), Linear(size.hidden, code)
         )
 
     def initial(self, n: int) -> Latent:
@@ -234,7 +233,7 @@ class RSSM(nn.Module):
         own = gru.hidden.weight[:, : self.size.deter // gru.blocks]
         action_half = action_embed.transpose(0, 1) @ action_part + gru.hidden.bias
         deters, stochs, logits = FilterScan.apply(
-            self.unimix,
+            Constants(self.unimix, self.size.gates, self.size.norm_eps),
             generator,
             is_first.t(),
             action_half,

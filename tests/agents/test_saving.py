@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import zipfile
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files import archive, model_file
 from wpt_agents.files.model_file import read_model, write_model
+from wpt_agents.model.networks import SIZES
 
 
 @pytest.fixture
@@ -78,6 +80,24 @@ def test_a_model_of_numpys_numbers_is_saved(tmp_path):
     agent(return_norm=np.True_, **numbers).save(tmp_path / "model.zip")
     loaded = WPT.load(tmp_path / "model.zip")
     assert (loaded.gamma, loaded.max_action_dim, loaded.seed) == (0.5, 3, 1)
+
+
+@pytest.mark.parametrize("as_fields", [False, True])
+def test_a_size_without_a_name_is_saved_with_its_fields(tmp_path, as_fields):
+    size = replace(SIZES["debug"], depth=8, gates="across", norm_eps=1e-5)
+    model = agent(size=asdict(size) if as_fields else size)
+    model.save(tmp_path / "model.zip")
+    loaded = WPT.load(tmp_path / "model.zip")
+    assert loaded.policy.size == size
+    assert same(weights(loaded), weights(model))
+    np.testing.assert_array_equal(acts(loaded), acts(model))
+    with pytest.raises(ValueError, match=r"trained with size=\{'deter': 64"):
+        WPT.load(tmp_path / "model.zip", size="debug")
+
+
+def test_a_size_equal_to_a_named_one_is_saved_by_its_name(tmp_path):
+    model = agent(size=replace(SIZES["tiny"]))
+    assert model.hyperparameters["size"] == model.size == "tiny"
 
 
 def test_a_dotted_name_never_loads_another_file(tmp_path):

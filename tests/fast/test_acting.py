@@ -1,6 +1,7 @@
 """The quick step of acting is the defined one, whatever becomes of the weights."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from toy_env import LENGTH, DotEnv
 
 from wpt_agents.fast import acting
 from wpt_agents.fast.acting import PATCHES, FastStep
+from wpt_agents.model.networks import SIZES
 
 NAMES = ("deter", "stoch", "action")
 
@@ -38,7 +40,10 @@ def assert_defined(policy, n=1, **kwargs):
         np.testing.assert_allclose(fast[name], expected[name], atol=1e-5, err_msg=name)
 
 
-@pytest.mark.parametrize("size", ["debug", "tiny"])
+ACROSS = replace(SIZES["tiny"], gates="across", norm_eps=0.3)
+
+
+@pytest.mark.parametrize("size", ["debug", "tiny", ACROSS])
 @pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("n", [1, 2, PATCHES // 36 + 1])  # 14 x 14 patches make 6 x 6
 def test_the_quick_step_is_the_defined_one(size, deterministic, n):

@@ -1,6 +1,7 @@
 """Bad input: each error names the culprit and the remedy, and nothing is lost."""
 
 import inspect
+from dataclasses import asdict
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from wpt_agents.agents import wpt
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.networks import SIZES
 from wpt_agents.training import checks, pretraining, updates
 from wpt_agents.zoo.plan.runs import make_plan
 
@@ -289,6 +291,12 @@ def test_the_debug_settings_are_all_keywords_of_the_constructor():
         ("train_ratio", None, "train_ratio is a number from 0 on, got None"),
         ("return_norm", "no", "return_norm is True or False, got 'no'"),
         ("size", 3, "No size 3"),
+        ("size", asdict(SIZES["debug"]) | {"gates": "over"}, "No gate layout 'over'"),
+        ("size", asdict(SIZES["debug"]) | {"depht": 4}, "No field of Size 'depht'.*depth"),
+        ("size", asdict(SIZES["debug"]) | {"hidden": 30.0}, "hidden must be a whole number"),
+        ("size", asdict(SIZES["debug"]) | {"deter": 60}, "deter=60 cannot be divided into 8"),
+        ("size", asdict(SIZES["debug"]) | {"norm_eps": 0}, "norm_eps must be a number above 0"),
+        ("size", {"deter": 64}, "lacks hidden, stoch, classes, depth, units"),
         ("unimix", 0, "unimix=0 allows latents of probability 0"),
         ("train_ratio", -1, "train_ratio is a number from 0 on, got -1"),
         ("learning_rate", float("nan"), "learning_rate is a number from 0 on"),
@@ -302,7 +310,7 @@ def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
 def test_every_keyword_that_is_no_schedule_is_checked():
     lists = checks.COUNTS, checks.SWITCHES, checks.SHARES, checks.AMOUNTS
     checked = {name for names in [*lists, checks.CHOICES] for name in names}
-    assert wpt.HYPERPARAMETERS - checked == {"guidance", "kickstart", "embodiment", "seed"}
+    assert wpt.HYPERPARAMETERS - checked == {"guidance", "kickstart", "embodiment", "seed", "size"}
     keywords = inspect.signature(WPT.__init__).parameters
     none = {name for name in wpt.HYPERPARAMETERS if keywords[name].default is None}
     assert none == set(checks.OPTIONAL)

@@ -13,7 +13,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -37,7 +37,7 @@ from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.fast.compiled import compile_loops
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, draw_pairs, random_shift
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.networks import Size, find_size, plain_size
 from wpt_agents.model.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
 from wpt_agents.training.checks import (
     check_dataset,
@@ -73,7 +73,8 @@ class WPT(Pretraining, BaseAlgorithm):
 
     :param policy: "WPTPolicy"
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param size: the widths of all networks: debug, tiny, small, medium or paper
+    :param size: the widths of all networks: debug, tiny, small, medium, paper, or a `Size` or its
+        fields
     :param dataset: D_off, for rehearsal and guidance: whatever `TrajectoryDataset.of` takes
     :param max_action_dim: A, the width that all actions are padded to
     :param embodiment: the robot's name; retrieval keeps to data that bears it or no name, and warns
@@ -151,7 +152,7 @@ class WPT(Pretraining, BaseAlgorithm):
         policy: str | type[WPTPolicy] = "WPTPolicy",
         env: GymEnv | str | None = None,
         *,
-        size: str = "paper",
+        size: str | Size | Mapping[str, Any] = "paper",
         dataset: Data | None = None,
         max_action_dim: int = 12,
         embodiment: str | None = None,
@@ -196,14 +197,15 @@ class WPT(Pretraining, BaseAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         given = {k: plain(v) for k, v in locals().items() if k in HYPERPARAMETERS}
-        self.hyperparameters = given
         check_hyperparameters(given)
+        widths = find_size(size)
+        self.hyperparameters = given = {**given, "size": plain_size(size)}
         for name, value in given.items():
             setattr(self, name, value)
         super().__init__(
             policy,
             None,
-            learning_rate=SIZES[size].learning_rate if learning_rate is None else learning_rate,
+            learning_rate=widths.learning_rate if learning_rate is None else learning_rate,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -238,7 +240,7 @@ class WPT(Pretraining, BaseAlgorithm):
 
     def _setup_model(self) -> None:
         self.set_random_seed(self.seed)
-        size = SIZES[self.size]
+        size = find_size(self.size)
         small = size.stabilised
         self.return_norm = small if self.return_norm is None else self.return_norm
         zero = small if self.zero_init_heads is None else self.zero_init_heads

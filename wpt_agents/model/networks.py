@@ -3,9 +3,9 @@
 import itertools
 import math
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from wpt_agents.files.names import unknown_name
+
 NORM_EPS = 1e-3
+GATES = ("within", "across")
 PIECE = 2**22  # numbers in the largest tensor that a stack of layers makes on a CPU: 16 MB
 MANY, WORK = 256, 2**22  # rows and multiplications from which on a convolution pays for a product
 IMAGES = 16  # of which a convolution takes these rows for the pixels
@@ -65,6 +68,22 @@ class Size:
     gates: str = "within"
     norm_eps: float = NORM_EPS
 
+    def __post_init__(self) -> None:
+        for name in ("deter", "hidden", "stoch", "classes", "depth", "units", "blocks"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"Size.{name} must be a whole number of at least 1, got {value!r}")
+        for name in ("deter", "hidden", "units"):
+            value = getattr(self, name)
+            if value * (1 if name == "deter" else 2) % self.blocks:
+                raise ValueError(f"Size.{name}={value} cannot be divided into {self.blocks} blocks")
+        if self.gates not in GATES:
+            raise unknown_name("gate layout", self.gates, GATES)
+        for name in ("norm_eps", "learning_rate", "actor_critic_learning_rate"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not 0 < value < math.inf:
+                raise ValueError(f"Size.{name} must be a number above 0, got {value!r}")
+
 
 # `paper`: Table 2 prints 12288 as hidden and 1536 as deterministic; only the other way round does
 # the world model count the 280 M parameters of the text (tests/test_world_model.py counts them).
@@ -75,6 +94,33 @@ SIZES = {
     "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
     "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5, stabilised=False),
 }
+
+
+def find_size(size: str | Size | Mapping[str, Any]) -> Size:
+    """Return the size of this name, or with these fields.
+
+    :raises ValueError: an unknown name or field, a missing field, a value that makes no sense
+    """
+    if isinstance(size, Size):
+        return size
+    if not isinstance(size, Mapping):
+        if not isinstance(size, str) or size not in SIZES:
+            raise unknown_name("size", size, SIZES)
+        return SIZES[size]
+    known = {field.name: field.default is MISSING for field in fields(Size)}
+    for name in size:
+        if name not in known:
+            raise unknown_name("field of Size", name, known)
+    lacking = [name for name, required in known.items() if required and name not in size]
+    if lacking:
+        raise ValueError(f"size={dict(size)} lacks {', '.join(lacking)}")
+    return Size(**size)
+
+
+def plain_size(size: str | Size | Mapping[str, Any]) -> str | dict[str, Any]:
+    """Return the name of a size, or its fields if it has none: what a model file can store."""
+    found = find_size(size)
+    return next((name for name, each in SIZES.items() if each == found), asdict(found))
 
 
 def split_gates(gates: Tensor, blocks: int, layout: str) -> tuple[Tensor, ...]:

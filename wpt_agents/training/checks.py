@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
 from wpt_agents.files.names import unknown_name
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.networks import find_size
 
 IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
 
@@ -35,7 +35,6 @@ AMOUNTS = (  # and those that may be 0 but not less
 
 
 CHOICES: dict[str, Collection[str]] = {
-    "size": SIZES,
     "precision": ("fp32", "bf16"),
     "free_nats_mode": ("mean", "element"),
     "retrieval": ("nearest", "random"),
@@ -54,6 +53,7 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
     :raises ValueError: a count that is no whole number from 1 on, a share outside [0, 1], something
         else that is no number from 0 on, an unknown choice
     """
+    find_size(given["size"])
     for name, value in given.items():
         if name in OPTIONAL and value is None:
             continue

@@ -6,7 +6,7 @@ comes before.
 
 import os
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Self
@@ -19,6 +19,7 @@ from tqdm.auto import tqdm
 from wpt_agents.data.importers.convert import Data
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.files.model_file import read_model
+from wpt_agents.model.networks import Size
 from wpt_agents.training.distributed import Divided, World, joined, local_device
 from wpt_agents.training.saving import Saving
 from wpt_agents.training.updates import PRETRAIN, Updates, note, torch_seed
@@ -38,7 +39,7 @@ class Pretraining(Updates, Saving):
         dataset: Data,
         env: GymEnv | str | None = None,
         steps: int = 200_000,
-        size: str = "paper",
+        size: str | Size | Mapping[str, Any] = "paper",
         run_dir: str | os.PathLike[str] | None = None,
         seed: int | None = None,
         progress_bar: bool = False,

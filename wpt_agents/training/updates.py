@@ -24,7 +24,7 @@ from wpt_agents.model.actor_critic import (
     return_range,
 )
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, recent_frames
-from wpt_agents.model.networks import PIECE, SIZES, frozen
+from wpt_agents.model.networks import PIECE, find_size, frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
@@ -46,7 +46,7 @@ class Updates:
     num_timesteps: int
     cloned: bool
     kickstart_schedule: Schedule
-    size: str
+    size: str | dict[str, Any]
     actor_critic_learning_rate: float | None
     max_action_dim: int
     batch_size: int
@@ -70,7 +70,7 @@ class Updates:
         policy, model_rate = self.policy, float(self.learning_rate)
         rate = self.actor_critic_learning_rate
         if rate is None:
-            rate = SIZES[self.size].actor_critic_learning_rate
+            rate = find_size(self.size).actor_critic_learning_rate
         model = policy.world_model
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self._optimizer(parts, model_rate)

@@ -1,0 +1,82 @@
+"""n-step transitions, by hand on episodes of five steps."""
+
+import numpy as np
+import pytest
+
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.transitions import concatenate, draw_transitions, n_step_return
+
+
+def episode(length=5, terminated=False, actions=2, rewards=True):
+    """Image t is t everywhere, action t is t / 10, reward t is t + 1."""
+    image = np.repeat(np.arange(length + 1, dtype=np.uint8), 64 * 64 * 3)
+    action = np.tile(np.arange(length)[:, None] / 10, actions)
+    reward = np.arange(1.0, length + 1)
+    return Trajectory(image.reshape(-1, 64, 64, 3), action, reward if rewards else None, terminated)
+
+
+def drawn(trajectories, n_steps, size=200, gamma=0.5, action_dim=2):
+    rng = np.random.default_rng(0)
+    return draw_transitions(trajectories, size, n_steps, gamma, action_dim, rng)
+
+
+def by_start(batch):
+    """{s: (frames, R, D, next frames)}."""
+    rows = {}
+    for i in range(len(batch)):
+        seen, then = (x[i, :, 0, 0, 0].tolist() for x in (batch.image, batch.next_image))
+        rows[seen[-1]] = (seen, batch.reward[i].item(), batch.discount[i].item(), then)
+    return rows
+
+
+def test_n_step_return_by_hand():
+    # R = 1 + 0.5 * 2 + 0.25 * 3 = 2.75 and D = 0.5^3
+    assert n_step_return(np.array([1.0, 2.0, 3.0]), 0.5, False) == (2.75, 0.125)
+    assert n_step_return(np.array([1.0, 2.0, 3.0]), 0.5, True) == (2.75, 0.0)
+    assert n_step_return(np.array([4.0]), 0.5, False) == (4.0, 0.5)
+
+
+def test_no_start_lies_within_the_last_steps_and_a_time_limit_is_bootstrapped_from():
+    rows = by_start(drawn([episode()], 3))
+    assert rows == {
+        0: ([0, 0, 0], 1 + 1 + 0.75, 0.125, [1, 2, 3]),
+        1: ([0, 0, 1], 2 + 1.5 + 1, 0.125, [2, 3, 4]),
+        2: ([0, 1, 2], 3 + 2 + 1.25, 0.125, [3, 4, 5]),
+    }
+
+
+def test_nothing_is_bootstrapped_from_behind_a_terminal_state():
+    rows = by_start(drawn([episode(terminated=True)], 3))
+    assert {s: row[2] for s, row in rows.items()} == {0: 0.125, 1: 0.125, 2: 0.0}
+    assert rows[2][1] == 6.25  # the last reward counts all the same
+
+
+def test_an_episode_shorter_than_n_steps_is_drawn_whole():
+    assert by_start(drawn([episode(2)], 3)) == {0: ([0, 0, 0], 2.0, 0.25, [0, 1, 2])}
+
+
+def test_starts_are_equally_likely_across_episodes_of_unequal_length():
+    batch = drawn([episode(1), episode(9)], 1, size=5000)
+    times = batch.image[:, -1, 0, 0, 0].numpy()
+    counts = np.bincount(times, minlength=9)
+    assert len(counts) == 9  # start 0 twice, of either episode, the other eight once
+    np.testing.assert_allclose(counts / 5000, [0.2] + [0.1] * 8, atol=0.02)
+
+
+def test_unknown_rewards_are_zero_and_narrow_actions_are_padded():
+    batch = drawn([episode(actions=1, rewards=False)], 1, action_dim=3)
+    assert (batch.reward == 0).all() and (batch.discount == 0.5).all()
+    assert (batch.action[:, 1:] == 0).all()
+    np.testing.assert_allclose(batch.action[:, 0] * 10, batch.image[:, -1, 0, 0, 0], rtol=1e-6)
+
+
+def test_parts_are_concatenated_in_order():
+    one, other = drawn([episode(5)], 1, size=3), drawn([episode(2)], 1, size=2)
+    both = concatenate([one, other])
+    assert len(both) == 5
+    assert (both.reward[:3] == one.reward).all() and (both.image[3:] == other.image).all()
+
+
+def test_no_episodes_are_refused():
+    with pytest.raises(ValueError, match="no episodes"):
+        drawn([], 1)

@@ -1,0 +1,105 @@
+"""n-step transitions of stacked frames, drawn from whole episodes: the batches of DrQ-v2 and RLPD.
+
+An episode is stored once. A transition's six frames are looked up when it is drawn, so a replay of
+75,000 steps takes 0.9 GB where one that stores stacked observations takes 5.5 GB.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wpt_agents.data.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """N steps of behaviour and what came of each within n steps.
+
+    :param image: (N, F, 64, 64, 3) uint8, the frames up to o_s, oldest first
+    :param action: (N, A) float32, a_s
+    :param reward: (N,) float32, R of `n_step_return`; 0 where rewards are unknown
+    :param discount: (N,) float32, D of `n_step_return`, the weight of the value at `next_image`
+    :param next_image: (N, F, 64, 64, 3) uint8, the frames up to o_{s+n}
+    """
+
+    image: Tensor
+    action: Tensor
+    reward: Tensor
+    discount: Tensor
+    next_image: Tensor
+
+    def __post_init__(self) -> None:
+        sizes = {f.name: len(getattr(self, f.name)) for f in fields(self)}
+        assert len(set(sizes.values())) == 1, sizes
+        assert self.image.shape == self.next_image.shape, (self.image.shape, self.next_image.shape)
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    def to(self, device: torch.device | str) -> "Transitions":
+        """The same transitions on `device`."""
+        return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def concatenate(parts: Sequence[Transitions]) -> Transitions:
+    """The rows of all parts, in order."""
+    names = [f.name for f in fields(Transitions)]
+    return Transitions(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})
+
+
+def n_step_return(reward: np.ndarray, gamma: float, terminated: bool) -> tuple[float, float]:
+    """R = Σ_i γ^i r_i, and D = γ^n, or D = 0 if the last step led to a terminal state.
+
+    A time limit is no terminal state: its last image is bootstrapped from like any other.
+
+    :param reward: (n,), the rewards of the steps s .. s + n - 1
+    :return: R and D of the target R + D Q(o_{s+n})
+    """
+    powers = gamma ** np.arange(len(reward) + 1)
+    return float(powers[:-1] @ reward), 0.0 if terminated else float(powers[-1])
+
+
+def draw_transitions(
+    trajectories: Sequence[Trajectory],
+    size: int,
+    n_steps: int,
+    gamma: float,
+    action_dim: int,
+    rng: np.random.Generator,
+    frames: int = 3,
+) -> Transitions:
+    """Draws transitions whose n steps lie inside one episode, every start equally likely.
+
+    Before an episode's third image its first one stands for those that are missing, as in acting.
+    Episodes shorter than n steps are drawn whole. DrQ-v2 draws an episode and then a start in it,
+    which is the same where all episodes are equally long.
+
+    :param size: N, the number of transitions
+    :param n_steps: n, at least 1
+    :param action_dim: A; narrower actions are padded with zeros
+    :raises ValueError: there is no trajectory
+    """
+    if not trajectories:
+        raise ValueError("There are no episodes to draw transitions from; collect some first")
+    starts = np.cumsum([max(len(t) - n_steps, 0) + 1 for t in trajectories])
+    drawn = rng.integers(starts[-1], size=size)
+    chosen = np.searchsorted(starts, drawn, side="right")
+    begin = drawn - np.concatenate([[0], starts])[chosen]
+    image = np.empty((2, size, frames, *trajectories[0].image.shape[1:]), np.uint8)
+    action = np.zeros((size, action_dim), np.float32)
+    outcome = np.zeros((2, size), np.float32)
+    before = np.arange(1 - frames, 1)
+    for row, (i, s) in enumerate(zip(chosen, begin, strict=True)):
+        trajectory = trajectories[i]
+        end = min(s + n_steps, len(trajectory))
+        for side, time in enumerate((s, end)):
+            image[side, row] = trajectory.image[np.maximum(time + before, 0)]
+        action[row, : trajectory.action_dim] = trajectory.action[s, : trajectory.action_dim]
+        reward = np.zeros(end - s) if trajectory.reward is None else trajectory.reward[s:end]
+        terminated = trajectory.terminated and end == len(trajectory)
+        outcome[:, row] = n_step_return(reward, gamma, terminated)
+    tensors = [torch.from_numpy(array) for array in (image[0], action, *outcome, image[1])]
+    return Transitions(*tensors)

@@ -1,0 +1,146 @@
+"""How the model-free agents act: the networks see the last three images and keep no other state."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from torch import Generator, Tensor
+
+from wpt_agents.data.trajectory import IMAGE_SIZE
+from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.model.networks import Size
+from wpt_agents.model.policy import State, stack_frames, to_images
+
+
+class FramePolicy(BasePolicy):
+    """Acts on the last three images. Subclasses say which networks there are and how they decide.
+
+    The networks are as wide as the environment's own actions. They are drawn again whenever
+    `set_action_space` is called with another width.
+
+    :param observation_space: the environment's; images are converted at the border
+    :param action_space: a Box
+    :param clone_size: the widths of the prior actor, or None for no prior actor
+    """
+
+    action_space: spaces.Box
+    action_mask: Tensor  # (A,) bool, all True: nothing is padded
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        clone_size: Size | None = None,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        self.clone_size = clone_size
+        self.generator: Generator | None = None  # of collection; `predict` leaves it alone
+        self.std = 1.0  # of the noise added to actions in collection, where there is any
+        self.reset_behavior()
+
+    @property
+    def action_dim(self) -> int:
+        """A, the width of the actions."""
+        return self.action_space.shape[0]
+
+    def reset_behavior(self) -> None:
+        """Draws all networks that belong to a task."""
+        device = self.device
+        mask = torch.ones(self.action_dim, dtype=torch.bool)
+        self.register_buffer("action_mask", mask, persistent=False)
+        if self.clone_size is not None:
+            self.prior_actor = PriorActor(self.clone_size, self.action_dim)
+        self.build()
+        self.to(device)
+
+    def build(self) -> None:
+        """Draws the networks for actions of width `action_dim`."""
+        raise NotImplementedError
+
+    def decide(
+        self, frames: Tensor, deterministic: bool, generator: Generator | None = None
+    ) -> Tensor:
+        """The actions: (N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1]."""
+        raise NotImplementedError
+
+    def set_action_space(self, action_space: spaces.Box) -> None:
+        """Acts in this space from now on."""
+        width = self.action_dim
+        self.action_space = action_space
+        if self.action_dim != width:
+            self.reset_behavior()
+
+    def initial_state(self, n: int) -> State:
+        """The acting state of n fresh episodes: the last images, (n, F, 64, 64, 3)."""
+        return (np.zeros((n, FRAMES, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8),)
+
+    @torch.inference_mode()
+    def act(
+        self,
+        image: np.ndarray,
+        state: State | None,
+        episode_start: np.ndarray | None,
+        deterministic: bool = False,
+        generator: Generator | None = None,
+    ) -> tuple[np.ndarray, State]:
+        """One action for each environment.
+
+        :param image: (n, 64, 64, 3) uint8
+        :param state: from the step before, or None
+        :param episode_start: (n,) bool, where the state is reset
+        :param deterministic: act without noise
+        :param generator: of the noise; torch's own if None
+        :return: action (n, A) in [-1, 1], and the new state
+        """
+        if state is not None and len(state[0]) != len(image):
+            raise ValueError(
+                f"The state is of {len(state[0])} environments, the observation of {len(image)}: "
+                "pass state=None where all episodes begin"
+            )
+        frames = stack_frames(image, state[0] if state else None, episode_start)
+        action = self.decide(torch.from_numpy(frames).to(self.device), deterministic, generator)
+        if not action.isfinite().all():
+            raise ValueError("The actor's output is not finite: the weights are damaged")
+        return action.cpu().numpy(), (frames,)
+
+    def executed(self, state: State, action: np.ndarray) -> State:
+        """The state after another action than the policy's was taken: it holds no actions."""
+        return state
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's own action space."""
+        low, high = self.action_space.low, self.action_space.high
+        action = low + 0.5 * (action.clip(-1, 1) + 1) * (high - low)
+        return action.clip(low, high).astype(self.action_space.dtype)  # rounding may overstep
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """The action in the environment's own space, and the state to pass to the next call.
+
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
+            are converted
+        :param state: what the last call returned; None at the start
+        :param episode_start: (n,) bool, where an episode begins; None for nowhere
+        """
+        images, batched = to_images(observation)
+        action, state = self.act(images, state, episode_start, deterministic)
+        action = self.to_env(action)
+        return (action if batched else action[0]), state
+
+    def _predict(  # type: ignore[override]  # images alone, no dictionaries of them
+        self, observation: Tensor, deterministic: bool = False
+    ) -> Tensor:
+        """SB3's stateless form: every observation is taken for an episode's first."""
+        images, _ = to_images(observation.cpu().numpy())
+        action, _ = self.act(images, None, None, deterministic)
+        return torch.from_numpy(self.to_env(action)).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "clone_size": self.clone_size}

@@ -1,0 +1,88 @@
+"""Networks over stacked frames: the encoder and the trunk of DrQ-v2, RLPD and R3M."""
+
+from collections.abc import Sequence
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from wpt_agents.data.trajectory import IMAGE_SIZE
+from wpt_agents.model.behavior_cloning import FRAMES
+
+
+class FrameEncoder(nn.Module):
+    """3x3 convolutions without padding, each followed by ReLU, over frames stacked as channels.
+
+    :param channels: of each layer
+    :param strides: of each layer
+    :param frames: F, the number of frames that are stacked
+    :param centre: subtracted from the pixels, which are divided by 255 before
+    :ivar embed_dim: E, the width of the output
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[int],
+        strides: Sequence[int],
+        frames: int = FRAMES,
+        centre: float = 0.0,
+    ) -> None:
+        super().__init__()
+        assert len(channels) == len(strides), (channels, strides)
+        self.centre = centre
+        inputs, side = [3 * frames, *channels[:-1]], IMAGE_SIZE
+        self.layers = nn.ModuleList(
+            nn.Conv2d(i, o, 3, stride)
+            for i, o, stride in zip(inputs, channels, strides, strict=True)
+        )
+        for stride in strides:
+            side = (side - 3) // stride + 1
+        self.embed_dim = channels[-1] * side**2
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8, oldest first -> (N, E)."""
+        x = image.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255 - self.centre
+        for layer in self.layers:
+            x = F.relu(layer(x))
+        return x.flatten(1)
+
+
+class Trunk(nn.Sequential):
+    """From the encoder to a small latent z = tanh(LayerNorm(W e + b)): (N, E) -> (N, Z).
+
+    :param embed_dim: E
+    :param features: Z
+    """
+
+    def __init__(self, embed_dim: int, features: int) -> None:
+        super().__init__(nn.Linear(embed_dim, features), nn.LayerNorm(features), nn.Tanh())
+
+
+def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers with ReLU: (N, inputs) -> (N, outputs)."""
+    return nn.Sequential(
+        nn.Linear(inputs, hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, outputs),
+    )
+
+
+def orthogonal(module: nn.Module) -> None:
+    """DrQ-v2's initial weights: orthogonal, with gain sqrt 2 in convolutions, and zero biases.
+
+    Apply it with `network.apply(orthogonal)`.
+    """
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        gain = nn.init.calculate_gain("relu") if isinstance(module, nn.Conv2d) else 1.0
+        nn.init.orthogonal_(module.weight, gain)
+        assert module.bias is not None
+        nn.init.zeros_(module.bias)
+
+
+def xavier(module: nn.Module) -> None:
+    """RLPD's initial weights: Xavier's uniform ones and zero biases, for `network.apply`."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.xavier_uniform_(module.weight)
+        assert module.bias is not None
+        nn.init.zeros_(module.bias)

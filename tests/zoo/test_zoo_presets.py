@@ -175,7 +175,27 @@ def test_every_reference_names_a_task_that_exists_and_its_source():
         with open(preset_folder() / "references" / f"table{number}.csv") as file:
             for row in csv.DictReader(file):
                 assert row["source"].endswith(f"Table {number}")
+                assert ("ICLR 2026" in row["source"]) == (row["method"] == "ncrl")
                 assert row["task"] in ("mean", "median") or find_tasks(suite, [row["task"]])
+
+
+def test_the_later_version_of_the_paper_has_a_score_for_every_task():
+    scores, printed = reference([5], "ncrl", 150_000)
+    assert len(scores) == 22 and mean(scores) == pytest.approx(619.55, abs=0.01)
+    assert printed == {"mean": 617.73, "median": 733.3}  # the mean is misprinted
+    assert median(scores) == pytest.approx(733.3, abs=0.01)
+    scores, printed = reference([3, 4], "ncrl", 150_000)
+    assert len(scores) == 50 and mean(scores) == pytest.approx(printed["mean"], abs=0.001)
+    assert median(scores) == pytest.approx(printed["median"], abs=0.001)
+
+
+def test_the_authors_own_numbers_name_repository_and_commit():
+    with open(preset_folder() / "references" / "official.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8 * 3 * 2
+    for row in rows:
+        assert find_tasks("dmc", [row["task"]]) and re.search(r"at [0-9a-f]{7}, ", row["source"])
+        assert row["sd"] or row["samples"] == "500000" or row["method"] == "mrq-official"
 
 
 def plan(suite, tasks, preset, tmp_path, method="wpt", settings=(), data=None):

@@ -61,14 +61,21 @@ class Reference:
 
 @cache
 def references() -> tuple[Reference, ...]:
-    """Every number of the paper's Tables 3 to 5."""
+    """Every number of the paper's Tables 3 to 5, and of both baselines as their authors ran them.
+
+    The method `ncrl` is WPT as its ICLR 2026 version prints it. The files `table*.csv` are the
+    paper's tables; `official.csv` holds curves that the authors of DrQ-v2, DreamerV3 and MR.Q
+    published, of tasks in Table 5.
+    """
     found = []
-    for path in sorted((preset_folder() / "references").glob("table*.csv")):
+    folder = preset_folder() / "references"
+    for path in (*sorted(folder.glob("table*.csv")), folder / "official.csv"):
+        table = 5 if path.stem == "official" else int(path.stem[-1])
         with open(path, newline="") as file:
             for row in csv.DictReader(file):
                 score = float(row["score"]) if row["score"] else None
                 about = row["suite"], row["task"], row["method"], int(row["samples"])
-                found.append(Reference(int(path.stem[-1]), *about, score, row["source"]))
+                found.append(Reference(table, *about, score, row["source"]))
     return tuple(found)
 
 

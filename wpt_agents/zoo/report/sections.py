@@ -30,7 +30,17 @@ from wpt_agents.zoo.statistics import (
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
 TITLES = {3: "Meta-World", 4: "Meta-World, continued", 5: "DMControl"}
 SUITES = {"dmc": "DMControl", "metaworld": "Meta-World", "robotics": "Gymnasium-Robotics"}
-BASELINES = {"dreamer-v3": "Dreamer v3", "drq-v2": "DrQ v2", "wpt": "WPT"}
+BASELINES = {
+    "dreamer-v3": "Dreamer v3",
+    "drq-v2": "DrQ v2",
+    "wpt": "WPT",
+    "ncrl": "WPT (ICLR 2026)",
+}
+OFFICIAL = {  # what the authors of these published, on eight tasks of Table 5
+    "dreamer-v3-official": "Dreamer v3, its authors",
+    "drq-v2-official": "DrQ v2, its authors",
+    "mrq-official": "MR.Q, its authors",
+}
 THRESHOLDS = np.linspace(0, 1, 51)
 
 
@@ -257,16 +267,17 @@ def paper_table(
     ours = list(dict.fromkeys(name for _, name in cells))
     tasks = list(dict.fromkeys(row.task for row in printed))
     columns = list(dict.fromkeys((row.method, row.samples) for row in reversed(printed)))
+    names_of = BASELINES | OFFICIAL
     row = partial(table_row, printed=printed, columns=columns, ours=ours, cells=cells)
     shown = {*(task for task, _ in cells), *STATISTICS}
     rows = [row(task) for task in tasks if task in shown]
     return {
         "metric": "success rate" if printed[0].suite == "metaworld" else "return",
-        "columns": [f"{BASELINES[method]} @ {samples_text(n)}" for method, n in columns],
+        "columns": [f"{names_of[method]} @ {samples_text(n)}" for method, n in columns],
         "ours": {name: shared_about(rows, place) for place, name in enumerate(ours)},
         "rows": rows,
         "not_run": [row(task) for task in tasks if task not in shown],
-        "source": printed[0].source,
+        "source": "; ".join(dict.fromkeys(row.source for row in printed)),
         "misprints": any(aggregates.misprint(row) is not None for row in printed),
     }
 
@@ -283,7 +294,10 @@ def table_row(
     return {
         "task": task,
         "aggregate": task in STATISTICS,
-        "paper": [(held[c].score, aggregates.misprint(held[c])) for c in columns],
+        "paper": [
+            (held[c].score, aggregates.misprint(held[c])) if c in held else (None, None)
+            for c in columns
+        ],
         "ours": [
             our_cell(cells.get((task, name), []))
             if task not in STATISTICS

@@ -73,8 +73,8 @@ class WPT(Pretraining, BaseAlgorithm):
 
     :param policy: "WPTPolicy"
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param size: the widths of all networks: debug, tiny, small, medium, paper, or a `Size` or its
-        fields
+    :param size: the widths of all networks: debug, tiny, mid, small, medium, paper, or a `Size` or
+        its fields
     :param dataset: D_off, for rehearsal and guidance: whatever `TrajectoryDataset.of` takes
     :param max_action_dim: A, the width that all actions are padded to
     :param embodiment: the robot's name; retrieval keeps to data that bears it or no name, and warns
@@ -89,11 +89,15 @@ class WPT(Pretraining, BaseAlgorithm):
     :param lam: λ of Eq. (2)
     :param ent_coef: η of Eq. (4)
     :param imagine_horizon: H, imagined steps
+    :param imagine_starts: replayed states of a batch from which actor and critic imagine, drawn at
+        random; 0 for all of them, as in the paper; the size's own if None
     :param target_fraction: how far the target critic moves at an update
     :param dyn_scale: weight of the KL that teaches the prior
     :param rep_scale: weight of the KL that teaches the posterior
     :param free_nats: KL below which it teaches nothing
     :param free_nats_mode: "mean" (WPT) or "element" (DreamerV3)
+    :param data_dependent_init: before the first update of a new world model, standardise what its
+        posterior sees by 512 images of the data
     :param unimix: share of the uniform in the latents' distributions
     :param zero_init_heads: start reward head and critic at zero; the size's own if None
     :param return_norm: divide returns by their 5-95 % range, if above 1; the size's own if None
@@ -166,11 +170,13 @@ class WPT(Pretraining, BaseAlgorithm):
         lam: float = 0.95,
         ent_coef: float = 1e-4,
         imagine_horizon: int = 16,
+        imagine_starts: int | None = None,
         target_fraction: float = 0.02,
         dyn_scale: float = 1.0,
         rep_scale: float = 0.1,
         free_nats: float = 1.0,
         free_nats_mode: str = "mean",
+        data_dependent_init: bool = True,
         unimix: float = 0.01,
         zero_init_heads: bool | None = None,
         return_norm: bool | None = None,
@@ -228,6 +234,7 @@ class WPT(Pretraining, BaseAlgorithm):
         self.retrieved_ids: list[int] = []
         self.retrieved_of = ""  # the fingerprint of the dataset that they number
         self.pretrain_steps, self.episodes, self.updates = 0, 0, 0
+        self.initialised = not data_dependent_init  # whether the posterior has been standardised
         self.cloned, self.credit = False, 0.0
         self._rollout: Rollout | None = None
         self._seen_length: int | None = None  # of the longest episode

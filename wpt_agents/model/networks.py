@@ -53,6 +53,7 @@ class Size:
     :param gates: how the GRU's last layer orders its gates: "within" each block, as DreamerV3, or
         "across" the blocks, as the weights that the paper's authors publish
     :param norm_eps: eps of every layer norm but those over a convolution's channels (1e-3)
+    :param imagine_starts: states that dreams start from in an update; 0 for all of them
     """
 
     deter: int
@@ -67,6 +68,7 @@ class Size:
     blocks: int = 8
     gates: str = "within"
     norm_eps: float = NORM_EPS
+    imagine_starts: int = 0
 
     def __post_init__(self) -> None:
         for name in ("deter", "hidden", "stoch", "classes", "depth", "units", "blocks"):
@@ -90,6 +92,7 @@ class Size:
 SIZES = {
     "debug": Size(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
     "tiny": Size(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
+    "mid": Size(512, 128, 32, 8, 16, 256, 6e-4, 3e-4, imagine_starts=128),
     "small": Size(256, 128, 16, 16, 16, 256, 6e-4, 3e-4),
     "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
     "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5, stabilised=False),

@@ -19,6 +19,9 @@ from wpt_agents.model.networks import (
     split_gates,
 )
 
+MIN_STD = 0.01  # entries of an embedding that vary less are not scaled up further
+LOGITS_SCALE = 4.0  # found by held-out error and probes after 1,000 updates on cartpole
+
 
 class Latent(NamedTuple):
     """s = [h, z]: `deter` (..., D) and `stoch` (..., S, K), one-hot in each group."""
@@ -114,6 +117,23 @@ class RSSM(nn.Module):
         self.post_out = nn.Sequential(
             nn.LayerNorm(size.hidden, eps=size.norm_eps), nn.SiLU(), Linear(size.hidden, code)
         )
+
+    @torch.no_grad()
+    def standardise(self, embed: Tensor) -> None:
+        """Adapt the posterior's first and last layer to the data, before any update.
+
+        Most of an encoder's initial output is the same for every image. Images therefore hardly
+        change the initial posterior, its samples are noise, and the decoder learns the mean image
+        for thousands of updates. The first layer is changed to see (e - mean) / std instead of e,
+        and the last layer's weights are multiplied by 4, so that the samples depend on the image.
+
+        :param embed: (N, E), encoded images of the data
+        """
+        std, mean = torch.std_mean(embed, 0)
+        scaled = self.post_in.weight[:, self.size.deter :] / std.clamp_min(MIN_STD)
+        self.post_in.weight[:, self.size.deter :] = scaled
+        self.post_in.bias -= scaled @ mean
+        self.post_out[-1].weight *= LOGITS_SCALE
 
     def initial(self, n: int) -> Latent:
         """The state before an episode's first image: zeros."""

@@ -119,6 +119,11 @@ class WorldModel(nn.Module):
         """All of theta: everything but the reward head."""
         return [p for part in (self.encoder, self.rssm, self.decoder) for p in part.parameters()]
 
+    def standardise(self, image: Tensor) -> None:
+        """Adapt the initial posterior to images of the data: (N, 64, 64, 3) uint8."""
+        with torch.no_grad():
+            self.rssm.standardise(self.encoder(image).float())
+
     def observe(
         self, batch: Batch, generator: Generator | None = None
     ) -> tuple[Latent, Tensor, Tensor]:

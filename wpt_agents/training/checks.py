@@ -23,9 +23,10 @@ COUNTS = (  # keywords of WPT that count something there must be one of
 )
 OPTIONAL = (  # keywords that may be None
     *("learning_rate", "actor_critic_learning_rate", "episode_length", "embodiment", "seed"),
-    *("return_norm", "zero_init_heads"),
+    *("return_norm", "zero_init_heads", "imagine_starts"),
 )
-SWITCHES = "return_norm", "zero_init_heads", "compile"
+WHOLE = ("imagine_starts", "actor_delay")  # keywords that must be whole numbers, of at least 0
+SWITCHES = "return_norm", "zero_init_heads", "compile", "data_dependent_init"
 SHARES = ("gamma", "lam", "target_fraction", "unimix", "offline_ratio")
 AMOUNTS = (  # and those that may be 0 but not less
     *("learning_rate", "actor_critic_learning_rate", "bc_learning_rate", "weight_decay"),
@@ -63,6 +64,8 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
         least = 2 if name == "imagine_horizon" else 1  # the first state's value is no action's
         if name in COUNTS and not (number and isinstance(value, Integral) and int(value) >= least):
             raise ValueError(f"{name} is a whole number from {least} on, got {value!r}")
+        if name in WHOLE and not (number and isinstance(value, Integral) and int(value) >= 0):
+            raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
         if name in SWITCHES and not isinstance(value, bool):
             raise ValueError(f"{name} is True or False, got {value!r}")
         if name in SHARES and not (number and 0 <= value <= 1):

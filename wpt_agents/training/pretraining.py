@@ -92,6 +92,7 @@ class Pretraining(Updates, Saving):
         done, first = self.pretrain_steps, world.rank == 0
         told = {"steps": steps, "pretrain_steps": done, "accumulate": accumulate}
         world.check_same(told | self.hyperparameters | {"dataset": self.dataset.fingerprint})
+        self._initialise(self.dataset)
         shape = self.batch_size, self.batch_length, self.max_action_dim
         pin, share = self.device.type == "cuda", world.share(self.batch_size)
         batches = self.dataset.batches(

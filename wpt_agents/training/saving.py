@@ -34,7 +34,9 @@ COUNTERS = (  # where a model stands, besides its weights
     "retrieved_of",
     "_windows_drawn",
     "_seen_length",
+    "initialised",
 )
+LATER = {"initialised": True}  # counters that version 0.1 did not write, and their values there
 
 
 class Saving:
@@ -137,14 +139,15 @@ class Saving:
         self.policy.load_state_dict(tensors["policy"])
         for name in self._get_torch_save_params()[0][1:]:
             load_optimizer(getattr(self, name), tensors[name])
-        missing = set(COUNTERS) - about["counters"].keys()
+        counters = LATER | about["counters"]
+        missing = set(COUNTERS) - counters.keys()
         if missing:
             raise ValueError(
                 f"The model file lacks {', '.join(sorted(missing))}: it was written by an earlier "
                 "wpt_agents; train it again, or load it with the version that wrote it"
             )
         for name in COUNTERS:
-            setattr(self, name, about["counters"][name])
+            setattr(self, name, counters[name])
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
         """Writes the online episodes to one file."""

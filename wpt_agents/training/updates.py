@@ -14,6 +14,7 @@ from torch.autograd.graph import increment_version
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer, mix
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
@@ -30,7 +31,8 @@ from wpt_agents.model.rssm import Latent
 from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
 from wpt_agents.training.guidance import Schedule
 
-PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE = range(7)  # purposes of random streams
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE, INITIALISE = range(8)  # purposes of random streams
+INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior is adapted to
 
 
 class Updates:
@@ -43,6 +45,7 @@ class Updates:
     learning_rate: float
     stream_seed: int
     updates: int
+    initialised: bool
     num_timesteps: int
     cloned: bool
     kickstart_schedule: Schedule
@@ -83,8 +86,17 @@ class Updates:
         groups = [{"params": part} for part in parts]
         return AdamW(groups, rate, eps=1e-5, weight_decay=decay, fused=True)
 
+    def _initialise(self, data: TrajectoryDataset | ReplayBuffer) -> None:
+        """Standardise a new world model's posterior by 512 images of the data, once."""
+        if not self.initialised:
+            rng = self._stream(INITIALISE, 0)
+            batch = data.sample(*INITIAL_IMAGES, self.max_action_dim, rng)
+            self.policy.world_model.standardise(batch.image.flatten(0, 1).to(self.device))
+            self.initialised = True
+
     def update(self, metrics: dict[str, list[Tensor]]) -> None:
         """One gradient step of every network on a mixed batch; appends to `metrics`."""
+        self._initialise(self.replay_buffer)
         batch = mix(
             self.replay_buffer,
             self.retrieved,

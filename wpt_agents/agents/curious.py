@@ -242,7 +242,7 @@ class Plan2Explore(Explorer):
 
     saved_as = "Plan2Explore"
     curiosity: Ensemble
-    arrival: Tensor  # (B*T,), of the replayed states that the next dream starts from
+    arrival: Tensor  # (B*T,), of the replayed states, some of which the next dream starts from
 
     def _make_curiosity(self) -> Ensemble:
         outputs = self.policy.world_model.encoder.embed_dim
@@ -274,8 +274,9 @@ class Plan2Explore(Explorer):
         ensemble, feat = self.curiosity, dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        assert len(self.arrival) == len(surprise), (self.arrival.shape, surprise.shape)
-        return torch.cat([self.arrival[:, None], surprise], 1)
+        arrival = self.arrival[self.starts]
+        assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
+        return torch.cat([arrival[:, None], surprise], 1)
 
 
 EXPLORERS: dict[str, type[Explorer]] = {"icm": ICMExplorer, "plan2explore": Plan2Explore}

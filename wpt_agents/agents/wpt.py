@@ -28,6 +28,7 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
 from torch import Generator, Tensor
 from torch.optim import AdamW
+from torch.optim.lr_scheduler import LinearLR
 from tqdm.auto import tqdm
 
 from wpt_agents.data.dataset import TrajectoryDataset
@@ -106,18 +107,21 @@ class WPT(Pretraining, BaseAlgorithm):
     :param train_freq: when the updates that a step has earned are made: "episode", at its end, as
         in Algorithm 1, or "step", while the environments take the next one: side by side where they
         have processes of their own (`SubprocVecEnv`), and learning the same where they have not
-    :param learning_starts: steps collected before the first update
+    :param learning_starts: steps collected before the first update; they earn updates, too
     :param warmup_steps: steps driven by the prior actor alone (uniform random without one)
     :param offline_ratio: share of retrieved sequences in a batch; 0: no rehearsal
     :param guidance: schedule of the probability that an episode is guided; 0: none
     :param kickstart: weight, or schedule of it, at which the actor imitates the prior actor on the
         replayed images; not in the paper. 0: off; where the clone is good, try 20
+    :param actor_delay: updates of a head start, made when `learning_starts` is reached even if
+        fewer have been earned: reward head and critic learn while the actor only imitates the
+        prior actor; not in the paper
     :param episode_length: steps of an episode, for the guidance window; found out if None
     :param num_retrieve: R, trajectories to retrieve
     :param retrieval: "nearest", by Eq. (5), or "random", its ablation
     :param bc_steps: updates of the prior actor
     :param bc_batch_size: pairs in each
-    :param bc_learning_rate: of the prior actor
+    :param bc_learning_rate: of the prior actor, at its first update; it falls linearly to 0
     :param precision: "fp32", or "bf16" for the forward passes; on a CPU it pays from `small` on
     :param compile: whether `torch.compile` is to fuse the steps of scan and dream: for a GPU. The
         first updates take minutes, and numbers differ in rounding
@@ -188,6 +192,7 @@ class WPT(Pretraining, BaseAlgorithm):
         offline_ratio: float = 0.25,
         guidance: str | float = "linear(1,0,50000)",
         kickstart: str | float = 0.0,
+        actor_delay: int = 0,
         episode_length: int | None = None,
         num_retrieve: int = 500,
         retrieval: str = "nearest",
@@ -234,6 +239,7 @@ class WPT(Pretraining, BaseAlgorithm):
         self.retrieved_ids: list[int] = []
         self.retrieved_of = ""  # the fingerprint of the dataset that they number
         self.pretrain_steps, self.episodes, self.updates = 0, 0, 0
+        self.task_updates = 0
         self.initialised = not data_dependent_init  # whether the posterior has been standardised
         self.cloned, self.credit = False, 0.0
         self._rollout: Rollout | None = None
@@ -325,6 +331,7 @@ class WPT(Pretraining, BaseAlgorithm):
         """
         self.replay_buffer, self.retrieved, self.retrieved_ids = ReplayBuffer(), None, []
         self.cloned, self.credit, self._seen_length = False, 0.0, None
+        self.task_updates = 0
         self._rollout = self._last_obs = None
         self.policy.reset_behavior()
         self._setup_optimizers()
@@ -428,6 +435,7 @@ class WPT(Pretraining, BaseAlgorithm):
         policy, width, shown = self.policy, self.max_action_dim, self.retrieved.trajectories
         clone = deepcopy(policy.prior_actor)  # so that an interruption leaves nothing half-learnt
         optimizer = AdamW(clone.parameters(), self.bc_learning_rate, weight_decay=0)
+        decay = LinearLR(optimizer, 1.0, 0.0, self.bc_steps)  # else the last noisy step is kept
         for step in tqdm(range(self.bc_steps), desc="clone", disable=not progress_bar):
             pairs = draw_pairs(shown, self.bc_batch_size, width, self._stream(CLONE, step))
             image, action = (tensor.to(self.device) for tensor in pairs)
@@ -435,6 +443,7 @@ class WPT(Pretraining, BaseAlgorithm):
                 image = random_shift(image, generator=self._generator(CLONE, step))
                 loss = bc_loss(clone(image), action, policy.action_mask)
             self._descend(optimizer, loss, "bc")
+            decay.step()
         policy.prior_actor.load_state_dict(clone.state_dict())
         self.cloned = True
 
@@ -454,8 +463,7 @@ class WPT(Pretraining, BaseAlgorithm):
             new_obs, rewards, dones, infos = step_all(self.env, to_env, meanwhile)
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
-            if self.num_timesteps > self.learning_starts:
-                self.credit += self.n_envs
+            self.credit += self.n_envs
             finished = rollout.end_step(rewards, dones, last_images(infos, dones))
             for trajectory in finished:  # before the callback, which may save the replay buffer
                 for name, error in self.policy.heldout_errors(trajectory).items():
@@ -512,10 +520,11 @@ class WPT(Pretraining, BaseAlgorithm):
         """The gradient steps that the collected steps have earned."""
         if not self.replay_buffer.trajectories or self.train_ratio == 0:
             return
-        per_update = self.batch_size * self.batch_length
-        updates = int(self.credit * self.train_ratio / per_update)
-        price = per_update / self.train_ratio
-        rest = self.credit - updates * price
+        if self.num_timesteps < self.learning_starts:
+            return  # these steps earn updates, too, which are made once learning starts
+        price = self.batch_size * self.batch_length / self.train_ratio
+        updates = max(int(self.credit / price), self.actor_delay - self.task_updates)
+        rest = max(self.credit - updates * price, 0.0)
         metrics: dict[str, list[Tensor]] = defaultdict(list)
         for left in reversed(range(updates)):
             self.update(metrics)

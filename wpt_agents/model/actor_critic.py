@@ -1,10 +1,12 @@
 """Learning to act in imagination (A.3): Eq. (2) lambda_return, (3) critic_loss, (4) actor_loss."""
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from wpt_agents.model.distributions import BINS, TruncatedNormal, two_hot_loss, two_hot_mean
 from wpt_agents.model.networks import Head, Size
+
+CONTEXT = 3  # images behind a state from which on more of them improve predictions no further
 
 
 def lambda_return(reward: Tensor, value: Tensor, gamma: float = 0.99, lam: float = 0.95) -> Tensor:
@@ -20,6 +22,31 @@ def lambda_return(reward: Tensor, value: Tensor, gamma: float = 0.99, lam: float
         bootstrap = (1 - lam) * value[:, t + 1] + lam * returns[-1]
         returns.append(reward[:, t] + gamma * bootstrap)
     return torch.stack(returns[:0:-1], dim=1)
+
+
+def draw_starts(
+    batch_size: int, length: int, number: int, generator: Generator | None, device: torch.device
+) -> Tensor:
+    """Return which of the B x T replayed states dreams start from.
+
+    Algorithm 1 starts from all of them, and `number` 0 does so here. Gradients differ little from
+    start to start, so a random subset teaches about as much at a fraction of the cost. Every row
+    contributes the same number of states (to within one), which keeps the share of retrieved rows.
+    States that have seen fewer than three images are left out, because they know little.
+
+    :param number: how many, drawn without replacement; at most those with three images behind them
+    :return: (N,) indices into the flattened states, sorted
+    """
+    blind = CONTEXT - 1 if length >= CONTEXT else 0
+    if number == 0 or number > batch_size * (length - blind):
+        first = 0 if number == 0 else blind
+        every = torch.arange(batch_size * length, device=device).view(batch_size, length)
+        return every[:, first:].flatten()
+    order = torch.rand(batch_size, length, device=device, generator=generator)
+    order[:, :blind] = 2.0  # behind all others
+    ends = torch.arange(batch_size + 1, device=device) * number // batch_size
+    rank = order.argsort(1).argsort(1)
+    return (rank < ends.diff()[:, None]).flatten().nonzero().squeeze(1)
 
 
 def critic_loss(logits: Tensor, lambda_return: Tensor, gamma: float = 0.99) -> Tensor:

@@ -69,7 +69,7 @@ class WPTPolicy(BasePolicy):
 
     action_space: spaces.Box
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
-    return_scale: Tensor  # scalar, what returns are divided by
+    return_scale: Tensor  # scalar, what returns are divided by; 0 before the first returns
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class WPTPolicy(BasePolicy):
         self.zero_init_heads, self.actor_outscale = zero_init_heads, actor_outscale
         self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
-        self.register_buffer("return_scale", torch.ones(()))
+        self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
         self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self._fast_step: FastStep | None = None
@@ -102,7 +102,7 @@ class WPTPolicy(BasePolicy):
         self.target_critic = Critic(size).to(device).requires_grad_(False)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
-        self.return_scale.fill_(1)
+        self.return_scale.fill_(0)
 
     def set_action_space(self, action_space: spaces.Box) -> None:
         """Acts in this space from now on; entries past its width are masked everywhere."""

@@ -46,6 +46,10 @@ class Latent(NamedTuple):
         """(N, H + 1, ...) -> (N, H, ...)."""
         return Latent(self.deter[:, :-1], self.stoch[:, :-1])
 
+    def pick(self, index: Tensor) -> "Latent":
+        """(N, ...) -> (len(index), ...), the states of these numbers."""
+        return Latent(self.deter[index], self.stoch[index])
+
     def flatten_time(self) -> "Latent":
         """(B, T, ...) -> (B*T, ...)."""
         return Latent(self.deter.flatten(0, 1), self.stoch.flatten(0, 1))
@@ -132,8 +136,10 @@ class RSSM(nn.Module):
         std, mean = torch.std_mean(embed, 0)
         scaled = self.post_in.weight[:, self.size.deter :] / std.clamp_min(MIN_STD)
         self.post_in.weight[:, self.size.deter :] = scaled
-        self.post_in.bias -= scaled @ mean
-        self.post_out[-1].weight *= LOGITS_SCALE
+        self.post_in.bias.sub_(scaled @ mean)
+        for parameter in self.post_out[-1].parameters():
+            if parameter.dim() == 2:
+                parameter.mul_(LOGITS_SCALE)
 
     def initial(self, n: int) -> Latent:
         """The state before an episode's first image: zeros."""

@@ -35,8 +35,12 @@ COUNTERS = (  # where a model stands, besides its weights
     "_windows_drawn",
     "_seen_length",
     "initialised",
+    "task_updates",
 )
-LATER = {"initialised": True}  # counters that version 0.1 did not write, and their values there
+LATER = {
+    "initialised": True,
+    "task_updates": 0,
+}  # counters that version 0.1 did not write, and their values there
 
 
 class Saving:

@@ -20,6 +20,7 @@ from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
     actor_loss,
     critic_loss,
+    draw_starts,
     ema_update,
     lambda_return,
     return_range,
@@ -31,7 +32,8 @@ from wpt_agents.model.rssm import Latent
 from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
 from wpt_agents.training.guidance import Schedule
 
-PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE, INITIALISE = range(8)  # purposes of random streams
+# Purposes of random streams.
+PRETRAIN, UPDATE, CLONE, WINDOW, WARMUP, ACT, RETRIEVE, INITIALISE = range(8)
 INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior is adapted to
 
 
@@ -45,7 +47,9 @@ class Updates:
     learning_rate: float
     stream_seed: int
     updates: int
+    task_updates: int
     initialised: bool
+    starts: Tensor
     num_timesteps: int
     cloned: bool
     kickstart_schedule: Schedule
@@ -62,6 +66,8 @@ class Updates:
     free_nats: float
     free_nats_mode: str
     imagine_horizon: int
+    imagine_starts: int | None
+    actor_delay: int
     gamma: float
     lam: float
     ent_coef: float
@@ -108,13 +114,24 @@ class Updates:
         ).to(self.device)
         self._update_on(batch, metrics)
         self.updates += 1
+        self.task_updates += 1
 
     def _update_on(self, batch: Batch, metrics: dict[str, list[Tensor]]) -> None:
         """World model and reward head on the batch; actor and critic on dreams from its states."""
         generator = self._generator(UPDATE, self.updates)
         post = self._update_world_model(batch, metrics, generator, learn_reward=True)
         imitation = self._imitation(post, batch, metrics)
-        self._update_behavior(post.flatten_time(), metrics, generator, imitation)
+        self.starts = self._draw_starts(generator)
+        start = post.flatten_time().pick(self.starts)
+        self._update_behavior(start, metrics, generator, imitation)
+
+    def _draw_starts(self, generator: Generator) -> Tensor:
+        """Return the numbers of the batch's states to imagine from."""
+        number = self.imagine_starts
+        if number is None:
+            number = SIZES[self.size].imagine_starts
+        shape = self.batch_size, self.batch_length
+        return draw_starts(*shape, number, generator, self.device)
 
     def _update_world_model(
         self,
@@ -150,6 +167,10 @@ class Updates:
         The paper does not have it. Source: https://arxiv.org/abs/1803.03835
         """
         weight = self.kickstart_schedule(self.num_timesteps) if self.cloned else 0.0
+        if self._in_head_start() and self.cloned:
+            weight = max(
+                weight, 1.0
+            )  # the only term of the actor's loss, so its size is immaterial
         if weight == 0:
             return 0.0
         policy, mask = self.policy, self.policy.action_mask
@@ -162,6 +183,10 @@ class Updates:
         metrics["train/kickstart_loss"].append(loss.detach())
         return weight * loss
 
+    def _in_head_start(self) -> bool:
+        """Whether the actor still leaves the dreams to the critic."""
+        return self.task_updates < self.actor_delay
+
     def _update_behavior(
         self,
         start: Latent,
@@ -171,20 +196,29 @@ class Updates:
     ) -> None:
         """Actor and critic on imagined trajectories, Eq. (2) to (4).
 
+        During the head start (`actor_delay`) the actor's loss is the imitation alone, and without a
+        prior actor it is not updated: reward head and critic first learn what the dreams are worth.
+
         :param imitation: added to the actor's loss, and not to what is logged of it
         """
         policy = self.policy
-        with self._autocast():
+        ahead = self._in_head_start()
+        with self._autocast(), torch.set_grad_enabled(not ahead):
             dream = policy.dream(start, self.imagine_horizon, generator)
             reward = self._imagined_reward(dream)
             value = over_steps(policy.target_critic.value, dream.states)
             returns = lambda_return(reward, value, self.gamma, self.lam)
             spread = scale = torch.ones_like(policy.return_scale)
             if self.return_norm:
-                spread = policy.return_scale.lerp(return_range(returns), 0.01)
+                width = return_range(returns)
+                unknown = policy.return_scale == 0  # these are the first returns
+                spread = torch.where(unknown, width, policy.return_scale.lerp(width, 0.01))
                 scale = spread.clamp_min(1.0)
             loss = actor_loss(returns, dream.entropy, self.ent_coef, self.gamma, scale)
-        actor_norm = self._descend(self.actor_optimizer, loss + imitation, "actor")
+        objective = imitation if ahead else loss + imitation
+        actor_norm = torch.zeros_like(scale)
+        if isinstance(objective, Tensor):
+            actor_norm = self._descend(self.actor_optimizer, objective, "actor")
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self._autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())

@@ -93,8 +93,10 @@ class Run:
     def updates(self) -> int:
         """The fine-tuning updates that the run will make, within an episode's worth."""
         wpt = wpt_keywords() | self.wpt
-        steps = max(self.preset.steps - wpt["learning_starts"], 0)
-        return int(steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"]))
+        if self.preset.steps < wpt["learning_starts"]:
+            return 0
+        earned = self.preset.steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"])
+        return int(max(earned, wpt["actor_delay"]))
 
     @property
     def evaluation_seed(self) -> int:

@@ -129,7 +129,7 @@ class Updates:
         """Return the numbers of the batch's states to imagine from."""
         number = self.imagine_starts
         if number is None:
-            number = SIZES[self.size].imagine_starts
+            number = self.policy.size.imagine_starts
         shape = self.batch_size, self.batch_length
         return draw_starts(*shape, number, generator, self.device)
 

@@ -9,6 +9,7 @@ Example::
 """
 
 import inspect
+import os
 import sys
 import time
 import warnings
@@ -16,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import LinearLR
 from tqdm.auto import tqdm
 
+from wpt_agents.agents.official import export_model, import_model
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.importers.convert import Data
 from wpt_agents.data.replay import ReplayBuffer
@@ -277,6 +279,48 @@ class WPT(Pretraining, BaseAlgorithm):
             self.seed = self.stream_seed = seed
             self.hyperparameters = {**self.hyperparameters, "seed": seed}
         super().set_random_seed(seed)
+
+    # ----------------------------------------------------------------- the authors' own weights
+
+    @classmethod
+    def from_official(
+        cls,
+        path: str | os.PathLike[str],
+        env: GymEnv | str | None = None,
+        dataset: Data | None = None,
+        stoch: int | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Reads a model file of the paper's authors, such as `dmcontrol.pt`.
+
+        The widths and `max_action_dim` are inferred from the shapes. Reward head, actor, critic and
+        target critic are read if the file has them, and drawn if it has not.
+
+        :param path: a `torch.save` file of nested state dicts; it is read with `weights_only=True`
+        :param env: the environment to go on with
+        :param dataset: D_off, such as the authors' folder `ncrl_datasets/dmcontrol`
+        :param stoch: groups of z, if they are not the authors' 32
+        :param kwargs: further keywords of `WPT`
+        :raises FileNotFoundError: no such file
+        :raises ValueError: a file that is cut short, damaged, holds more than weights or is not of
+            the authors
+        """
+        cls._check_keywords(kwargs)
+        lean = cls is WPT  # explorers have networks of their own
+        model: Self = import_model(cls, path, stoch, lean, **kwargs)
+        model.set_dataset(dataset)
+        if env is not None:
+            model.set_env(env)
+        return model
+
+    def save_official(self, path: str | os.PathLike[str]) -> None:
+        """Writes the weights in the authors' format, so that their scripts can read them.
+
+        Actor, critic, target critic and reward head are written, too, learnt or not.
+
+        :raises ValueError: a model whose `Size` has other `gates` or `norm_eps` than the authors'
+        """
+        export_model(self.policy, path)
 
     # ------------------------------------------------------------------ the data and the task
 

@@ -1,0 +1,83 @@
+"""The weights that the paper's authors publish, as models of `WPT`, and the way back."""
+
+import os
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any
+
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+
+from wpt_agents.files.official import (
+    GATES,
+    NORM_EPS,
+    WORLD_MODEL,
+    official_name,
+    parameter_names,
+    read_official,
+    write_official,
+)
+from wpt_agents.model.networks import find_size
+from wpt_agents.model.policy import WPTPolicy
+
+Path = str | os.PathLike[str]
+FROM_FILE = ("size", "max_action_dim")
+
+
+class Undrawn(TorchFunctionMode):
+    """Leave new weights as they lie in memory; untouched, they take none of it."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func`, or only return its tensor if it would draw weights."""
+        kwargs = kwargs or {}
+        if func in (nn.init.uniform_, nn.init.kaiming_uniform_, Tensor.uniform_):
+            return kwargs["tensor"] if "tensor" in kwargs else args[0]
+        return func(*args, **kwargs)
+
+
+def import_model(
+    agent: Callable[..., Any], path: Path, stoch: int | None, lean: bool, **keywords: Any
+) -> Any:
+    """Make an agent with the weights of the authors' file; see `WPT.from_official`.
+
+    :param agent: `WPT` or a subclass
+    :param lean: make all networks without drawing their weights, to save memory and time; not for
+        an agent that has more networks than its policy's
+    """
+    for name in FROM_FILE:
+        if name in keywords:
+            raise ValueError(f"{name} is read from {path}: leave it out")
+    size, width, tensors = read_official(path, stoch)
+    with Undrawn() if lean else nullcontext():
+        model = agent(size=find_size(size), max_action_dim=width, **keywords)
+    check_shapes(model.policy, tensors, path)
+    dynamics = {ours for part in WORLD_MODEL for _, ours in parameter_names(part)}
+    heads = {name: tensors.pop(name) for name in tensors.keys() - dynamics}
+    tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
+    model.policy.load_state_dict(tensors, strict=False, assign=True)  # no second copy
+    model.reset_task()  # draws the heads, and makes optimisers of the new tensors
+    model.policy.load_state_dict(heads, strict=False)
+    return model
+
+
+def check_shapes(policy: WPTPolicy, tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse a tensor of another shape than the policy's."""
+    for name, own in policy.state_dict().items():
+        if name in tensors and tensors[name].shape != own.shape:
+            raise ValueError(
+                f"The tensors of {path} do not fit together: {official_name(name)} has the shape "
+                f"{tuple(tensors[name].shape)}, but the others ask for {tuple(own.shape)}"
+            )
+
+
+def export_model(policy: WPTPolicy, path: Path) -> None:
+    """Write a policy's weights in the authors' format; see `WPT.save_official`."""
+    size = policy.size
+    if (size.gates, size.norm_eps) != (GATES, NORM_EPS):
+        raise ValueError(
+            f"The authors' code computes another function of these weights: it needs a model of "
+            f"gates={GATES!r} and norm_eps={NORM_EPS}, this one has gates={size.gates!r} and "
+            f"norm_eps={size.norm_eps}"
+        )
+    weights = policy.state_dict()
+    write_official(path, {name.replace("_orig_mod.", ""): w for name, w in weights.items()})

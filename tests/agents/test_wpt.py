@@ -323,10 +323,10 @@ def test_the_latent_is_filtered_with_the_action_that_was_executed(monkeypatch):
         return act(image, state, first, *args, **kwargs)
 
     monkeypatch.setattr(policy, "act", spy)
-    rollout = Rollout(policy, 1, lambda: (1, 3))
     mine = np.array([[0.5, -0.25, 0, 0]], np.float32)
+    rollout = Rollout(policy, 1, 2, lambda: (1, 3), lambda frames: mine[: len(frames)])
     for _ in range(4):
-        rollout.act(noise(1), lambda frames: mine[: len(frames)])
+        rollout.act(noise(1))
         rollout.end_step(np.zeros(1), np.zeros(1, bool), {})
     fed = [state[2] for state, _ in seen]
     assert not fed[0].any() and not (fed[1] == mine)[:, :2].any()

@@ -11,17 +11,21 @@ from debug_agent import ClockEnv, agent, noise, pretrained, recorded, weights
 from test_exploration import explorer
 
 from wpt_agents import WPT
-from wpt_agents.agents import wpt
 from wpt_agents.agents.curious import ICMExplorer, Plan2Explore
 from wpt_agents.model import distributions, policy
 from wpt_agents.model.rssm import RSSM
-from wpt_agents.training import updates
+from wpt_agents.training import randomness, updates
 from wpt_agents.zoo.judge import diagnosis
 
 
 @pytest.fixture
 def other(monkeypatch):
-    for module in policy, updates, wpt, diagnosis:  # random numbers are the CPU's on both devices
+    for module in (
+        policy,
+        updates,
+        randomness,
+        diagnosis,
+    ):  # random numbers are the CPU's on both devices
         monkeypatch.setattr(module, "Generator", lambda device: torch.Generator())
     monkeypatch.setattr(
         distributions.Share, "__new__", lambda cls, *_: torch.Generator.__new__(cls)

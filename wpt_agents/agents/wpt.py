@@ -14,7 +14,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -27,7 +27,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
-from torch import Generator, Tensor
+from torch import Tensor
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LinearLR
 from tqdm.auto import tqdm
@@ -41,7 +41,13 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.fast.compiled import compile_loops
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, draw_pairs, random_shift
 from wpt_agents.model.networks import Size, find_size, plain_size
-from wpt_agents.model.policy import IMAGE_SPACE, PriorPolicy, WPTPolicy, to_images
+from wpt_agents.model.policy import (
+    IMAGE_SPACE,
+    PriorPolicy,
+    WPTPolicy,
+    prior_action,
+    to_images,
+)
 from wpt_agents.training.checks import (
     check_dataset,
     check_hyperparameters,
@@ -52,7 +58,7 @@ from wpt_agents.training.checks import (
 )
 from wpt_agents.training.guidance import draw_window, ever, parse_schedule
 from wpt_agents.training.pretraining import Pretraining
-from wpt_agents.training.rollout import Rollout, clone_guide, last_images, random_guide, step_all
+from wpt_agents.training.rollout import Rollout, last_images, step_all
 from wpt_agents.training.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
 NO_DATASET = (
@@ -268,7 +274,6 @@ class WPT(Pretraining, BaseAlgorithm):
             zero,
             self.actor_outscale,
         ).to(self.device)
-        self.policy.generator = Generator(self.device).manual_seed(self.stream_seed)
         if self.compile:
             compile_loops(self.policy)
         self._setup_optimizers()
@@ -501,7 +506,7 @@ class WPT(Pretraining, BaseAlgorithm):
         go_on, ended = True, False
         while go_on and not ended and self.num_timesteps < self._total_timesteps:
             image, _ = to_images(self._last_obs)
-            action = rollout.act(image, self._guide())
+            action = rollout.act(image)
             meanwhile = self._update_models if self.train_freq == "step" else None
             to_env = self.policy.to_env(action)
             new_obs, rewards, dones, infos = step_all(self.env, to_env, meanwhile)
@@ -527,9 +532,15 @@ class WPT(Pretraining, BaseAlgorithm):
 
     def _open_rollout(self) -> Rollout:
         if self._rollout is None or self._last_episode_starts.all():
-            self._rollout = Rollout(self.policy, self.n_envs, self._draw_window, self.embodiment)
-            assert self.policy.generator is not None
-            self.policy.generator.manual_seed(torch_seed(self._stream(ACT, self.episodes)))
+            self._rollout = Rollout(
+                self.policy,
+                self.n_envs,
+                self.action_space.shape[0],
+                self._draw_window,
+                self._guide,
+                self._generator(ACT, self.episodes),
+                self.embodiment,
+            )
         return self._rollout
 
     def _draw_window(self) -> tuple[int, int]:
@@ -553,10 +564,13 @@ class WPT(Pretraining, BaseAlgorithm):
         """Whether the prior actor will ever drive, or be imitated."""
         return ever(self.schedule) or ever(self.kickstart_schedule)
 
-    def _guide(self) -> Callable[[np.ndarray], np.ndarray]:
+    def _guide(self, frames: np.ndarray) -> np.ndarray:
+        """Act as the prior actor, or at random in the warm-up where there is none."""
         if self.cloned:
-            return clone_guide(self.policy)
-        return random_guide(self.policy, self._stream(WARMUP, self.num_timesteps))
+            return prior_action(self.policy, frames)
+        mask = self.policy.action_mask.cpu().numpy()
+        rng = self._stream(WARMUP, self.num_timesteps)
+        return (rng.uniform(-1, 1, (len(frames), len(mask))) * mask).astype(np.float32)
 
     # ------------------------------------------------------------------------ // Update Models
 

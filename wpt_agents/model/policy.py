@@ -88,7 +88,6 @@ class WPTPolicy(BasePolicy):
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
-        self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self._fast_step: FastStep | None = None
         self.set_action_space(action_space)
 
@@ -154,6 +153,10 @@ class WPTPolicy(BasePolicy):
         if not np.isfinite(state[-1]).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
         return state[-1], state
+
+    def executed(self, state: State, action: np.ndarray) -> State:
+        """Return the acting state after `action` (n, A) was executed instead of the policy's."""
+        return (*state[:-1], action)
 
     def step(
         self,

@@ -76,27 +76,30 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 
 
-def check_spaces(env: VecEnv, max_action_dim: int) -> None:
-    """Refuses an environment that WPT cannot act in; says when it will resize the images."""
+def check_spaces(env: VecEnv, max_action_dim: int | None = None) -> None:
+    """Refuse an environment that an agent cannot act in; warn where images will be resized.
+
+    :param max_action_dim: the largest number of actions, or None for any
+    """
     image, action = env.observation_space, env.action_space
     shape: tuple[int, ...] = getattr(image, "shape", None) or ()
     is_image = isinstance(image, spaces.Box) and image.dtype == np.uint8 and len(shape) == 3
     if not is_image or 3 not in (shape[0], shape[-1]):
         raise ValueError(
-            f"WPT sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
+            "The agent sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
             f"are {image}: render it to pixels, e.g. with gymnasium's AddRenderObservation"
         )
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         raise ValueError(
-            f"WPT acts in a one-dimensional Box, the environment takes {action}: wrap it so that "
-            "it takes continuous actions"
+            f"The agent acts in a one-dimensional Box, the environment takes {action}: wrap it so "
+            "that it takes continuous actions"
         )
     if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
         raise ValueError(
             f"The action space must have finite bounds, it is {action}: wrap the environment "
             "with gymnasium's RescaleAction or ClipAction"
         )
-    if action.shape[0] > max_action_dim:
+    if max_action_dim is not None and action.shape[0] > max_action_dim:
         raise ValueError(
             f"The environment has {action.shape[0]} actions, the model was made for at most "
             f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"

@@ -1,34 +1,68 @@
-"""The open episodes of n environments: what is being recorded, and who drives."""
+"""Collecting: the open episodes of several environments, and who decides on the actions."""
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.policy import State, WPTPolicy, prior_action, stack_frames, to_images
+from wpt_agents.model.policy import State, stack_frames, to_images
 
-Window = tuple[int, int]
+Window = tuple[int, int]  # steps start .. stop - 1 of an episode
+Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
+
+
+class Acting(Protocol):
+    """What a policy must be able to do in order to collect. A is the width of its actions."""
+
+    def initial_state(self, n: int) -> State:
+        """Return the recurrent state of n new episodes, a tuple of arrays (n, ...)."""
+
+    def act(
+        self,
+        image: np.ndarray,
+        state: State | None,
+        episode_start: np.ndarray | None,
+        deterministic: bool = False,
+        generator: Generator | None = None,
+    ) -> tuple[np.ndarray, State]:
+        """Return actions (n, A) in [-1, 1] for images (n, 64, 64, 3), and the next state."""
+
+    def executed(self, state: State, action: np.ndarray) -> State:
+        """Return the state after `action` (n, A) was executed, whoever decided on it."""
 
 
 class Rollout:
-    """Records steps until an episode ends, and lets the prior actor drive inside its window.
+    """Record steps until an episode ends, and let a guide act inside of its window.
 
-    :param policy: acts
-    :param n_envs: how many episodes are open at once
-    :param draw: called when an episode begins; the steps (start, stop) at which the guide drives
-    :param embodiment: written on each trajectory
+    :param policy: decides on the actions outside of the windows
+    :param n_envs: number of environments, each with one open episode
+    :param action_dim: width of the actions that are recorded, the environment's own
+    :param draw_window: called when an episode begins; the steps at which the guide acts
+    :param guide: decides on the actions inside of the windows
+    :param generator: random numbers of the policy
+    :param embodiment: name of the robot, written on each trajectory
     """
 
     def __init__(
         self,
-        policy: WPTPolicy,
+        policy: Acting,
         n_envs: int,
-        draw: Callable[[], Window],
+        action_dim: int,
+        draw_window: Callable[[], Window],
+        guide: Guide,
+        generator: Generator | None = None,
         embodiment: str | None = None,
     ) -> None:
-        self.policy, self.draw, self.embodiment = policy, draw, embodiment
+        self.policy = policy
+        self.action_dim = action_dim
+        self.draw_window = draw_window
+        self.guide = guide
+        self.generator = generator
+        self.embodiment = embodiment
         self.state: State = policy.initial_state(n_envs)
         self.frames: np.ndarray | None = None
         self.first = np.ones(n_envs, bool)
@@ -37,47 +71,48 @@ class Rollout:
         self.actions: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
         self.rewards: list[list[float]] = [[] for _ in range(n_envs)]
 
-    def act(self, image: np.ndarray, guide: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """One action per environment; the latent is filtered whoever drives.
+    def act(self, image: np.ndarray) -> np.ndarray:
+        """Return one action per environment. The policy sees every step, also those of the guide.
 
         :param image: (n, 64, 64, 3) uint8
-        :param guide: (k, F, 64, 64, 3) frames -> (k, A), the prior actor
         :return: (n, A) in [-1, 1]
         """
         for i in np.flatnonzero(self.first):
-            self.windows[i] = self.draw()
+            self.windows[i] = self.draw_window()
         self.frames = stack_frames(image, self.frames, self.first)
-        action, state = self.policy.act(
-            image, self.state, self.first, generator=self.policy.generator
-        )
+        action, state = self.policy.act(image, self.state, self.first, generator=self.generator)
         time = np.array([len(actions) for actions in self.actions])
         start, stop = np.array(self.windows).T
         guided = (start <= time) & (time < stop)
         if guided.any():
-            action[guided] = guide(self.frames[guided])
-        self.state = (state[0], state[1], action)
-        for i, (frame, each) in enumerate(zip(image, action, strict=True)):
+            action[guided] = self.guide(self.frames[guided])
+        self.state = self.policy.executed(state, action)
+        for i, (frame, row) in enumerate(zip(image, action, strict=True)):
             self.images[i].append(frame.copy())
-            self.actions[i].append(each[: self.policy.action_space.shape[0]].copy())
+            self.actions[i].append(row[: self.action_dim].copy())
         return action
 
     def end_step(
         self, reward: np.ndarray, done: np.ndarray, last: dict[int, tuple[np.ndarray, bool]]
     ) -> list[Trajectory]:
-        """Takes in the step's outcome; returns the episodes that it ended.
+        """Record what the step led to; return the episodes that it ended.
 
         :param reward: (n,)
         :param done: (n,) bool
         :param last: for each ended episode its last image (64, 64, 3) and whether it terminated
         """
         finished = []
-        for i, each in enumerate(reward):
-            self.rewards[i].append(float(each))
+        for i, value in enumerate(reward):
+            self.rewards[i].append(float(value))
             if done[i]:
                 image, terminated = last[i]
                 finished.append(self._finish(i, image, terminated))
         self.first = done.copy()
         return finished
+
+    def first_image(self, i: int) -> np.ndarray | None:
+        """Return the first image of an open episode, None before its first step."""
+        return self.images[i][0] if self.images[i] else None
 
     def _finish(self, i: int, image: np.ndarray, terminated: bool) -> Trajectory:
         trajectory = Trajectory(
@@ -87,51 +122,40 @@ class Rollout:
             terminated,
             embodiment=self.embodiment,
         )
-        self.images[i], self.actions[i], self.rewards[i] = [], [], []
+        self.images[i] = []
+        self.actions[i] = []
+        self.rewards[i] = []
         return trajectory
 
 
 def step_all(
     env: VecEnv, action: np.ndarray, meanwhile: Callable[[], None] | None = None
 ) -> VecEnvStepReturn:
-    """One step of every environment.
+    """Step every environment once.
 
-    :param meanwhile: what to do while worker processes step
-    :raises RuntimeError: a worker process is gone; what was learnt and recorded is not
+    :param meanwhile: called while worker processes step
+    :raises RuntimeError: a worker process died; what was learned and recorded is kept
     """
     try:
         env.step_async(action)
         try:
             if meanwhile is not None:
                 meanwhile()
-        finally:  # an answer left in the pipe would be taken for the next one
+        finally:  # an answer left in the pipe would be taken for that of the next step
             outcome = env.step_wait()
         return outcome
-    except (EOFError, ConnectionError) as error:  # all that SubprocVecEnv's pipes tell
+    except (EOFError, ConnectionError) as error:  # SubprocVecEnv's pipes say no more than this
         raise RuntimeError(
-            "A worker process of the vector environment died; its own error stands above, if it "
-            "left one. The model is whole: give set_env() a new environment and call "
+            "A worker process of the vector environment died; if it left an error message, it is "
+            "printed above. The model is intact: call set_env() with a new environment, then "
             "learn(..., reset_num_timesteps=False)"
         ) from error
 
 
-def clone_guide(policy: WPTPolicy) -> Callable[[np.ndarray], np.ndarray]:
-    """The prior actor as a guide."""
-    return lambda frames: prior_action(policy, frames)
-
-
-def random_guide(policy: WPTPolicy, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """Uniform random actions, for the warm-up where there is no clone."""
-    mask = policy.action_mask.cpu().numpy()
-
-    def guide(frames: np.ndarray) -> np.ndarray:
-        return (rng.uniform(-1, 1, (len(frames), len(mask))) * mask).astype(np.float32)
-
-    return guide
-
-
-def last_images(infos: list[dict], dones: np.ndarray) -> dict[int, tuple[np.ndarray, bool]]:
-    """For each ended episode its last image and whether it terminated (not a time limit)."""
+def last_images(
+    infos: list[dict[str, Any]], dones: np.ndarray
+) -> dict[int, tuple[np.ndarray, bool]]:
+    """Return for each ended episode its last image and whether it terminated (no time limit)."""
     return {
         int(i): (
             to_images(infos[i]["terminal_observation"])[0][0],

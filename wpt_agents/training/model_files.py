@@ -1,0 +1,71 @@
+"""What an agent's model file holds: keywords, counters, weights and optimisers, without pickle."""
+
+import os
+from collections.abc import Mapping
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor
+from torch.optim import Optimizer
+
+from wpt_agents.files.model_file import load_optimizer, optimizer_tensors, write_model
+
+ModelPath = str | os.PathLike[str] | BufferedIOBase
+
+
+def optimizers(learner: object) -> dict[str, Optimizer]:
+    """Return the optimisers among a learner's attributes by their names."""
+    return {name: value for name, value in vars(learner).items() if isinstance(value, Optimizer)}
+
+
+def write(path: ModelPath, about: Mapping[str, Any], policy: BasePolicy, learner: object) -> None:
+    """Write a model file, whole or not at all. The suffix .zip is added where there is none."""
+    if isinstance(path, str | os.PathLike) and not Path(path).suffix:
+        path = Path(path).with_suffix(".zip")
+    weights = policy.state_dict()  # of which compiled parts have other names
+    tensors = {"policy": {name.replace("_orig_mod.", ""): w for name, w in weights.items()}}
+    tensors |= {name: optimizer_tensors(value) for name, value in optimizers(learner).items()}
+    write_model(path, about, tensors)
+
+
+def restore(
+    tensors: Mapping[str, Mapping[str, Tensor]], policy: BasePolicy, learner: object
+) -> None:
+    """Load the weights and the optimisers' averages of a model file. Learning rates stay."""
+    policy.load_state_dict(tensors["policy"])
+    for name, value in optimizers(learner).items():
+        load_optimizer(value, tensors[name])
+
+
+def check_same(
+    about: Mapping[str, Any], hyperparameters: Mapping[str, Any], names: tuple[str, ...]
+) -> None:
+    """Refuse to load weights that were trained with other values of some keywords.
+
+    :raises ValueError: naming both values
+    """
+    for name in names:
+        was = about["hyperparameters"][name]
+        now = hyperparameters[name]
+        if was != now:
+            raise ValueError(
+                f"The model was trained with {name}={was!r}, now it is {now!r}. Pass the old "
+                "value, or use another model file or run_dir"
+            )
+
+
+def find(path: ModelPath) -> ModelPath:
+    """Return the path of an existing file, with the suffix that `write` adds where there is none.
+
+    :raises FileNotFoundError: a folder; the message lists the model files in it
+    """
+    if not isinstance(path, str | os.PathLike):
+        return path
+    path = Path(path)
+    file = path if path.suffix else path.with_suffix(".zip")
+    if path.is_dir() and not file.is_file():
+        names = ", ".join(sorted(item.name for item in path.glob("*.zip"))) or "no model file"
+        raise FileNotFoundError(f"{path} is a folder, which holds {names}: pass the file to load")
+    return file

@@ -1,0 +1,58 @@
+"""How far an agent has come: everything that its model file holds besides weights and keywords."""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
+from typing import Any, Self
+
+RENAMED = {"_windows_drawn": "windows_drawn", "_seen_length": "seen_length"}  # since version 0.1
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """Counters of an agent. Subclasses add what their algorithm needs to continue exactly.
+
+    A field that is added later needs `field(metadata={"earlier": value})`, the value for model
+    files that were written without it.
+
+    :ivar num_timesteps: calls of `env.step`, counted once for every environment
+    :ivar episodes: episodes that were collected
+    :ivar updates: updates that were made for a task
+    :ivar credit: collected steps that no update has used yet
+    :ivar windows_drawn: episodes for which a guidance window was drawn
+    :ivar seen_length: steps of the longest episode so far
+    """
+
+    num_timesteps: int = 0
+    episodes: int = 0
+    updates: int = 0
+    credit: float = 0.0
+    windows_drawn: int = 0
+    seen_length: int | None = None
+
+    @classmethod
+    def of(cls, saved: Mapping[str, Any]) -> Self:
+        """Read the counters of a model file, also of one that version 0.1 wrote.
+
+        :raises ValueError: naming the counters that are missing
+        """
+        found = {RENAMED.get(name, name): value for name, value in saved.items()}
+        names = {item.name for item in fields(cls)}
+        earlier = {i.name: i.metadata["earlier"] for i in fields(cls) if "earlier" in i.metadata}
+        found = earlier | {name: value for name, value in found.items() if name in names}
+        if missing := names - found.keys():
+            raise ValueError(
+                f"The model file lacks {', '.join(sorted(missing))}: it was written by an earlier "
+                "version of wpt_agents. Train the model again, or load it with that version"
+            )
+        return cls(**found)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counters by name, as model files hold them."""
+        return asdict(self)
+
+    def reset(self, *names: str) -> None:
+        """Set some counters back to their defaults."""
+        for item in fields(self):
+            if item.name in names:
+                made = item.default if item.default_factory is MISSING else item.default_factory()
+                setattr(self, item.name, made)

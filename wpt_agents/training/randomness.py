@@ -1,0 +1,53 @@
+"""Random numbers that depend on a seed, a purpose and a counter, and on nothing else.
+
+There is no state to save: an agent that is loaded and continues draws what it would have drawn if
+it had never stopped.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from torch import Generator, device
+
+
+class Purpose(IntEnum):
+    """What random numbers are drawn for. The values are part of every seed: never reuse one."""
+
+    PRETRAIN = 0
+    UPDATE = 1
+    CLONE = 2
+    WINDOW = 3
+    WARMUP = 4
+    ACT = 5
+    RETRIEVE = 6
+    RESET = 100  # of the environment, before an explorer's episode
+
+
+@dataclass(frozen=True)
+class Streams:
+    """Independent streams of random numbers.
+
+    Example::
+
+        Streams(seed=0).numpy(Purpose.CLONE, 7)  # always the same numbers
+    """
+
+    seed: int
+
+    def numpy(self, purpose: Purpose, counter: int) -> np.random.Generator:
+        """Return NumPy's generator at the beginning of a stream."""
+        return np.random.default_rng([self.seed, int(purpose), counter])
+
+    def torch(self, purpose: Purpose, counter: int, device: device | str = "cpu") -> Generator:
+        """Return torch's generator at the beginning of a stream."""
+        return Generator(device).manual_seed(self.integer(purpose, counter))
+
+    def integer(self, purpose: Purpose, counter: int) -> int:
+        """Return a seed for other generators."""
+        return torch_seed(self.numpy(purpose, counter))
+
+
+def torch_seed(rng: np.random.Generator) -> int:
+    """Return a seed for torch's generators."""
+    return int(rng.integers(2**31))

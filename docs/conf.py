@@ -24,11 +24,10 @@ version = release = PROJECT["version"]
 extensions = [
     "myst_nb",  # Markdown and notebooks
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx_copybutton",
 ]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # tests/test_tutorials.py executes the notebooks
 

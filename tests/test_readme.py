@@ -1,5 +1,6 @@
 """README and docs say what is so: the example runs, and every name, keyword and value exists."""
 
+import ast
 import inspect
 import re
 import shlex
@@ -27,14 +28,18 @@ from wpt_agents.zoo.tasks import find_tasks
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-PAGES = {path.name: path.read_text() for path in (ROOT / "docs").glob("*.md")}
+PAGES = {
+    str(path.relative_to(ROOT / "docs")): path.read_text()
+    for path in sorted((ROOT / "docs").rglob("*.md"))
+    if "_build" not in path.parts
+}
 TINY = {  # what the example says -> what runs here
     "wpt/metaworld-drawer-close-v0": "Dot-v0",
     "wpt/metaworld-door-close-v0": "OtherDot-v0",
     "wpt/dmc-walker-stand-v0": "ThirdDot-v0",
     'behaviour="scripted"': 'behaviour="noise"',
     "episodes=20": "episodes=2",
-    'load_preset("metaworld", "demo").wpt': "SETTINGS",
+    "**settings": "**SETTINGS",
     "steps=1500": "steps=2",
     "learn(4000": "learn(75",
 }
@@ -44,19 +49,18 @@ def blocks(text, language="python"):
     return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
-def section(title):
-    return re.search(rf"## {title}\n(.*?)(?=\n## |\Z)", README, re.S)[1]
+def section(title, page=README):
+    return re.search(rf"## {title}\n(.*?)(?=\n## |\Z)", page, re.S)[1]
 
 
-EXAMPLE = blocks(section("The whole method in a script"))[0]
-LISTED = section("The zoo: data, runs and tables from the command line")
+EXAMPLE = blocks(section("Example"))[0]
 COMMANDS = {
     command.replace("\\\n", " ")
     for text in [README, *PAGES.values()]
     for block in blocks(text, "bash")
     for command in re.findall(r"^python -m wpt_agents\.zoo ((?:.*\\\n)*[^#\n]*)", block, re.M)
 }
-NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name"))
+NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name", PAGES["paper.md"]))
 
 
 def make_dot(rendering="near", render_mode=None):
@@ -87,16 +91,24 @@ def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
     assert len(left["model"].retrieved_ids) == 3 and (tmp_path / "drawer.zip").exists()
 
 
-def test_the_example_is_short_and_its_preset_exists():
-    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 24
+def test_the_readme_is_short():
+    assert len(README.split()) <= 900
+    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 26
+
+
+def test_the_examples_keywords_are_those_of_the_demo():
     demo = load_preset("metaworld", "demo")
     assert demo.env.rendering in EXAMPLE and demo.collect.behaviour in EXAMPLE
+    calls = [node for node in ast.walk(ast.parse(EXAMPLE)) if isinstance(node, ast.Call)]
+    made = next(call for call in calls if getattr(call.func, "id", "") == "dict")
+    settings = {keyword.arg: ast.literal_eval(keyword.value) for keyword in made.keywords}
+    assert settings.items() <= demo.wpt.items() and len(settings) == 15
 
 
-def test_ones_own_data_are_stored_as_the_readme_says(tmp_path, monkeypatch):
+def test_ones_own_data_are_stored_as_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image, action = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((3, 7), np.float32)
-    exec(blocks(section("Your own data"))[0], left := {"image": image, "action": action})
+    exec(blocks(PAGES["importing.md"])[0], left := {"image": image, "action": action})
     assert left["dataset"].embodiments == ["arm"]
 
 
@@ -123,25 +135,26 @@ def test_every_command_of_readme_and_docs_is_understood(command):
 
 
 def test_every_task_and_keyword_that_is_named_exists():
-    assert set(re.findall(r"wpt/[a-z-]+-v0", README)) <= TASKS.keys()
-    assert f"registers {len(TASKS)} ids" in README
-    told = section("The tasks").split("Keywords of `gym.make`")[1].split("\n\n")[0]
-    given = set(re.findall(r"`(\w+)(?:=\w+)?`", told)) - {"exact", "near", "fast"}
-    assert given == inspect.signature(dmc.make).parameters.keys() - {"task", "render_mode"}
+    for page in (README, *PAGES.values()):
+        assert set(re.findall(r"wpt/[a-z-]+-v0", page)) <= TASKS.keys()
+    assert f"registers {len(TASKS)} tasks" in PAGES["envs.md"]
+    assert f"{len(TASKS)} from pixels" in README
+    keywords = set(re.findall(r"^\| `(\w+)` \|", section("Keywords", PAGES["envs.md"]), re.M))
+    assert keywords == inspect.signature(dmc.make).parameters.keys() - {"task", "render_mode"}
 
 
-@pytest.mark.parametrize("text", [README, *PAGES.values()], ids=["README.md", *PAGES])
-def test_links_lead_somewhere(text):
-    folder = ROOT if text is README else ROOT / "docs"
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
-        assert (folder / target).exists(), target
+@pytest.mark.parametrize("name", ["../README.md", *PAGES])
+def test_links_lead_somewhere(name):
+    path = ROOT / "docs" / name
+    for target in re.findall(r"\]\((?!http)([^)#]+)(?:#[^)]*)?\)", path.read_text()):
+        assert (path.parent / target).exists(), target
 
 
-def test_the_versions_in_the_readme_lie_within_the_bounds():
+def test_the_versions_in_the_results_lie_within_the_bounds():
     packaging = import_module("packaging.specifiers")
     project = (ROOT / "pyproject.toml").read_text()
     for name, version in re.findall(
-        r"([a-z0-9_-]+) (\d+\.\d+\.\d+)", section("Versions that work.*")
+        r"([a-z0-9_-]+) (\d+\.\d+\.\d+)", section("Versions that work.*", PAGES["results.md"])
     ):
         bound = re.search(rf'"{name.replace("dm_control", "dm-control")}([<>=][^"]*)"', project)
         assert name == "mujoco" or packaging.SpecifierSet(bound[1]).contains(version), name

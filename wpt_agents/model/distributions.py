@@ -58,7 +58,7 @@ def exponential(like: Tensor, generator: Noise = None) -> Tensor:
 
 
 def symlog(x: Tensor) -> Tensor:
-    """sign(x) ln(|x| + 1): squeezes rewards and returns of any scale."""
+    """`sign(x) ln(|x| + 1)`: squeezes rewards and returns of any scale."""
     return torch.sign(x) * torch.log1p(x.abs())
 
 

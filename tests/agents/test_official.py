@@ -192,6 +192,13 @@ def test_fine_tuning_goes_on_from_their_weights(path, tmp_path):
     assert same(weights(WPT.load(tmp_path / "tuned.zip")), after)
 
 
+def test_the_first_update_does_not_initialise_their_posterior_again():
+    model = tiny(dataset=[recorded()], env=DotEnv(), learning_rate=0.0, weight_decay=0.0)
+    before = weights(model, "world_model")
+    model.learn(30)
+    assert model.updates > 0 and same(before, weights(model, "world_model"))
+
+
 def test_widths_are_the_files_and_not_to_be_given():
     with pytest.raises(ValueError, match=r"max_action_dim is read from .*leave it out"):
         tiny(max_action_dim=12)

@@ -57,6 +57,7 @@ def import_model(
     model.policy.load_state_dict(tensors, strict=False, assign=True)  # no second copy
     model.reset_task()  # draws the heads, and makes optimisers of the new tensors
     model.policy.load_state_dict(heads, strict=False)
+    model.initialised = True  # the posterior is trained: not to be adapted to any data
     return model
 
 

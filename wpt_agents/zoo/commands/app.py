@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from wpt_agents.zoo.commands import data, runs, trained
+from wpt_agents.zoo.commands import data, models, runs, trained
 from wpt_agents.zoo.commands.bench import bench
 from wpt_agents.zoo.commands.options import Spaced
 from wpt_agents.zoo.commands.report import report
@@ -22,6 +22,7 @@ app = typer.Typer(
     "`python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo`.",
 )
 data.register(app)
+app.command("import-model")(models.import_model)
 app.command("list")(runs.list_tasks)
 app.command("pretrain", cls=Spaced)(runs.pretrain_model)
 app.command("run", cls=Spaced)(runs.run_benchmark)

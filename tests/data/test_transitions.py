@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.data.transitions import concatenate, draw_transitions, n_step_return
+from wpt_agents.data.transitions import concatenate, draw_transitions, n_step_return, random_shift
 
 
 def episode(length=5, terminated=False, actions=2, rewards=True):
@@ -80,3 +82,36 @@ def test_parts_are_concatenated_in_order():
 def test_no_episodes_are_refused():
     with pytest.raises(ValueError, match="no episodes"):
         drawn([], 1)
+
+
+def grid_shift(image, shift, pad):
+    """DrQ-v2's own form of the shift: pad by the border, then sample a grid bilinearly."""
+    n, _, size, _ = image.shape
+    padded = F.pad(image, (pad,) * 4, "replicate")
+    eps = 1 / (size + 2 * pad)
+    line = torch.linspace(-1 + eps, 1 - eps, size + 2 * pad)[:size]
+    grid = torch.stack(torch.meshgrid(line, line, indexing="ij")[::-1], -1)[None]
+    move = (shift.flip(-1) + pad).view(n, 1, 1, 2) * 2 / (size + 2 * pad)
+    return F.grid_sample(padded, grid + move, padding_mode="zeros", align_corners=False)
+
+
+def test_the_shift_is_that_of_drqv2_and_the_same_for_all_frames_of_a_stack():
+    n, pad = 6, 4
+    image = np.random.default_rng(0).integers(0, 256, (n, 3, 64, 64, 3)).astype(np.uint8)
+    shift = torch.from_numpy(np.random.default_rng(3).integers(0, 2 * pad + 1, (n, 2)) - pad)
+    assert len({tuple(s.tolist()) for s in shift}) > 1  # each stack has a shift of its own
+    moved = torch.from_numpy(random_shift(image, pad, np.random.default_rng(3)))
+    planes = torch.from_numpy(image).permute(0, 1, 4, 2, 3).flatten(1, 2).float()
+    expected = grid_shift(planes, shift, pad).unflatten(1, (3, 3)).permute(0, 1, 3, 4, 2)
+    torch.testing.assert_close(moved.float(), expected, atol=0.01, rtol=0)
+
+
+def test_both_observations_are_shifted_and_by_different_offsets():
+    rng = np.random.default_rng(0)
+    image = np.repeat(rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8), 6, 0)
+    still = Trajectory(image, np.zeros((5, 2)), np.zeros(5))  # o and o' show the same
+    batch = draw_transitions([still], 20, 1, 0.9, 2, rng, pad=4)
+    shown = torch.from_numpy(image[:3])
+    moved = [[bool((x != shown).any()) for x in side] for side in (batch.image, batch.next_image)]
+    assert np.mean(moved) > 0.9  # one shift of 81 is none
+    assert (batch.image != batch.next_image).flatten(1).any(1).float().mean() > 0.9

@@ -1,4 +1,4 @@
-"""A plain second implementation of what the model-free learners share: layers, shift, Adam."""
+"""A plain second implementation of what the model-free learners share: layers and Adam."""
 
 import numpy as np
 import torch
@@ -32,17 +32,6 @@ def two_layers(w, name, x):
     for i in (0, 2):
         x = (x @ w[f"{name}.{i}.weight"].T + w[f"{name}.{i}.bias"]).clamp_min(0)
     return x @ w[f"{name}.4.weight"].T + w[f"{name}.4.bias"]
-
-
-def shift(image, pad, generator):
-    """One offset for each stack, the border repeated, one image after the other."""
-    offsets = torch.randint(-pad, pad + 1, (len(image), 2), generator=generator).numpy()
-    moved = []
-    for stack, (down, right) in zip(image.numpy(), offsets, strict=True):
-        bordered = np.pad(stack, ((0, 0), (pad, pad), (pad, pad), (0, 0)), "edge")
-        top, left = pad + down, pad + right
-        moved.append(bordered[:, top : top + 64, left : left + 64])
-    return torch.from_numpy(np.stack(moved)).float()
 
 
 class Adam:

@@ -1,11 +1,9 @@
-"""The networks over stacked frames: widths, input scaling, initial weights; and the shift."""
+"""The networks over stacked frames: widths, input scaling, initial weights."""
 
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import nn
 
-from wpt_agents.model.behavior_cloning import random_shift
 from wpt_agents.model.frames import FrameEncoder, Trunk, mlp, orthogonal, xavier
 
 
@@ -61,26 +59,3 @@ def test_a_trunk_and_an_mlp_by_hand():
     torch.testing.assert_close(z, torch.tensor([[-1.0, 1.0]]).tanh(), atol=1e-4, rtol=0)
     # (1, 2) > relu(3, 3) > relu(6, 6) > 12
     torch.testing.assert_close(layers(torch.tensor([[1.0, 2.0]])), torch.tensor([[12.0]]))
-
-
-def grid_shift(image, shift, pad):
-    """DrQ-v2's own form of the shift: pad by the border, then sample a grid bilinearly."""
-    n, _, size, _ = image.shape
-    padded = F.pad(image, (pad,) * 4, "replicate")
-    eps = 1 / (size + 2 * pad)
-    line = torch.linspace(-1 + eps, 1 - eps, size + 2 * pad)[:size]
-    grid = torch.stack(torch.meshgrid(line, line, indexing="ij")[::-1], -1)[None]
-    move = (shift.flip(-1) + pad).view(n, 1, 1, 2) * 2 / (size + 2 * pad)
-    return F.grid_sample(padded, grid + move, padding_mode="zeros", align_corners=False)
-
-
-def test_the_shift_is_that_of_drqv2_and_the_same_for_all_frames_of_a_stack():
-    n, pad = 6, 4
-    image = torch.randint(0, 256, (n, 3, 64, 64, 3), dtype=torch.uint8)
-    generator = torch.Generator().manual_seed(3)
-    shift = torch.randint(-pad, pad + 1, (n, 2), generator=generator)
-    assert len({tuple(s.tolist()) for s in shift}) > 1  # each stack has a shift of its own
-    moved = random_shift(image, pad, torch.Generator().manual_seed(3))
-    planes = image.permute(0, 1, 4, 2, 3).flatten(1, 2).float()
-    expected = grid_shift(planes, shift, pad).unflatten(1, (3, 3)).permute(0, 1, 3, 4, 2)
-    torch.testing.assert_close(moved.float(), expected, atol=0.01, rtol=0)

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from torch import Generator, Tensor, nn
 from torch.optim import Adam
 
-from wpt_agents.agents.drqv2 import augment, descend
+from wpt_agents.agents.frame_agent import descend
 from wpt_agents.data.transitions import Transitions
 from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.ensembles import CriticEnsemble, RewardEnsemble
@@ -190,9 +190,9 @@ class RLPDLearner:
     """
 
     def __init__(
-        self, policy: RLPDPolicy, learning_rate: float, tau: float, beta: float = 1.0, pad: int = 4
+        self, policy: RLPDPolicy, learning_rate: float, tau: float, beta: float = 1.0
     ) -> None:
-        self.policy, self.tau, self.beta, self.pad = policy, tau, beta, pad
+        self.policy, self.tau, self.beta = policy, tau, beta
         value = [*policy.encoder.parameters(), *policy.critic.parameters()]
         self.critic_optimizer = Adam(value, learning_rate, fused=True)
         self.actor_optimizer = Adam(policy.actor.parameters(), learning_rate, fused=True)
@@ -212,15 +212,18 @@ class RLPDLearner:
         :param online: how many rows are of the environment
         """
         policy = self.policy
-        image, next_image = augment(batch, self.pad, generator)
         with torch.no_grad():
-            next_embed = policy.encoder(next_image)
+            next_embed = policy.encoder(batch.next_image)
             mean, log_std = policy.actor(next_embed)
             next_action, _ = tanh_sample(mean, log_std, generator)
-            member = torch.randint(policy.critics, (), generator=generator, device=image.device)
-            next_q = policy.target_critic(policy.target_encoder(next_image), next_action)[member]
+            member = torch.randint(
+                policy.critics, (), generator=generator, device=batch.reward.device
+            )
+            next_q = policy.target_critic(policy.target_encoder(batch.next_image), next_action)[
+                member
+            ]
         reward, metrics = self._labelled(batch.reward, next_embed, online, generator)
-        embed = policy.encoder(image)
+        embed = policy.encoder(batch.image)
         q = policy.critic(embed, batch.action)
         value_loss = critic_loss(q, td_target(reward, batch.discount, next_q))
         descend(self.critic_optimizer, value_loss, "critic")

@@ -44,6 +44,27 @@ class Transitions:
         return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
+def random_shift(image: np.ndarray, pad: int, rng: np.random.Generator) -> np.ndarray:
+    """Shift each stack of frames by up to `pad` pixels in both directions, repeating the border.
+
+    It is DrQ-v2's augmentation, whose bilinear sampling always falls on whole pixels.
+
+    :param image: (N, F, H, W, C)
+    :return: (N, F, H, W, C), the frames of one stack shifted alike
+    """
+    n, frames, height, width, colours = image.shape
+    offset = rng.integers(0, 2 * pad + 1, (n, 2))
+    middle = slice(pad, pad + height), slice(pad, pad + width)
+    padded = np.empty((n, frames, height + 2 * pad, width + 2 * pad, colours), image.dtype)
+    padded[:, :, middle[0], middle[1]] = image
+    padded[:, :, middle[0], :pad] = image[:, :, :, :1]
+    padded[:, :, middle[0], pad + width :] = image[:, :, :, -1:]
+    padded[:, :, :pad] = padded[:, :, pad : pad + 1]
+    padded[:, :, pad + height :] = padded[:, :, pad + height - 1 : pad + height]
+    moved = [x[:, y : y + height, z : z + width] for x, (y, z) in zip(padded, offset, strict=True)]
+    return np.stack(moved)
+
+
 def concatenate(parts: Sequence[Transitions]) -> Transitions:
     """The rows of all parts, in order."""
     names = [f.name for f in fields(Transitions)]
@@ -69,6 +90,7 @@ def draw_transitions(
     gamma: float,
     action_dim: int,
     rng: np.random.Generator,
+    pad: int = 0,
     frames: int = 3,
 ) -> Transitions:
     """Draws transitions whose n steps lie inside one episode, every start equally likely.
@@ -80,6 +102,8 @@ def draw_transitions(
     :param size: N, the number of transitions
     :param n_steps: n, at least 1
     :param action_dim: A; narrower actions are padded with zeros
+    :param pad: pixels by which `image` and `next_image` are shifted at most, independently
+    :param frames: F, the images in a stack
     :raises ValueError: there is no trajectory
     """
     if not trajectories:
@@ -101,5 +125,6 @@ def draw_transitions(
         reward = np.zeros(end - s) if trajectory.reward is None else trajectory.reward[s:end]
         terminated = trajectory.terminated and end == len(trajectory)
         outcome[:, row] = n_step_return(reward, gamma, terminated)
-    tensors = [torch.from_numpy(array) for array in (image[0], action, *outcome, image[1])]
+    now, then = (random_shift(side, pad, rng) if pad else side for side in image)
+    tensors = [torch.from_numpy(array) for array in (now, action, *outcome, then)]
     return Transitions(*tensors)

@@ -1,0 +1,202 @@
+"""What DrQ-v2, RLPD and MR.Q share as agents: stacked frames, n-step batches and offline data."""
+
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from torch import Tensor
+from torch.optim import Optimizer
+
+from wpt_agents.agents.base import PixelAgent
+from wpt_agents.data.importers.convert import Data
+from wpt_agents.data.related import related_trajectories
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.data.transitions import Transitions, draw_transitions
+from wpt_agents.model.frame_policy import FramePolicy
+from wpt_agents.training.keywords import (
+    Keywords,
+    Stage,
+    amount,
+    choice,
+    count,
+    keyword,
+    must,
+    share,
+)
+from wpt_agents.training.model_files import optimizers
+from wpt_agents.training.progress import Progress
+from wpt_agents.training.randomness import Purpose
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameKeywords(Keywords):
+    """The keywords that DrQ-v2, RLPD and MR.Q have in common."""
+
+    learning_rate: float = amount(1e-4, "learning rate of all networks")
+    batch_size: int = count(256, "transitions in a batch")
+    gamma: float = share(0.99, "discount of one step")
+    pad: int = count(4, "pixels by which images are shifted at most", least=0)
+    task: str | None = keyword(
+        None,
+        must("a name", lambda value: isinstance(value, str)),
+        "name of the task in the dataset; the environment's id if None. Offline data are the "
+        "trajectories of this task, or else of the robot `embodiment`",
+        Stage.RETRIEVAL,
+    )
+    num_retrieve: int = count(500, "offline trajectories to use at most", Stage.RETRIEVAL)
+    learning_starts: int = count(
+        2_000, "steps that are collected before the first update", Stage.ACTING, least=0
+    )
+    warmup_steps: int = count(
+        2_000,
+        "steps at the start that uniform random actions drive, to the end of the episode",
+        Stage.ACTING,
+        least=0,
+    )
+    train_freq: str = choice(
+        "step",
+        ("episode", "step"),
+        "when the updates that a step has paid for are made: 'step', while the environments take "
+        "the next one, or 'episode', at its end",
+        Stage.ACTING,
+    )
+
+
+@dataclass(kw_only=True)
+class FrameProgress(Progress):
+    """How far an agent has come, and which offline data it uses.
+
+    :ivar retrieved_ids: numbers of the offline trajectories
+    :ivar retrieved_of: the fingerprint of the dataset that they number
+    :ivar cloned: whether the prior actor has been trained
+    """
+
+    retrieved_ids: list[int] = field(default_factory=list)
+    retrieved_of: str = ""
+    cloned: bool = False
+
+
+class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
+    """An agent that learns from transitions of stacked frames."""
+
+    policy: FramePolicy
+    hyperparameters: FrameKeywords
+    progress: FrameProgress
+    retrieved: ReplayBuffer | None = None
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "CnnPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        dataset: Data | None = None,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+        **keywords: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            dataset=dataset,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            _init_setup_model=_init_setup_model,
+            **keywords,
+        )
+
+    def unbound_action_space(self) -> spaces.Box:
+        """Return the action space of an agent without an environment; `set_env` replaces it."""
+        return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    @property
+    def offline_rewards(self) -> bool:
+        """Whether the rewards of offline data are used."""
+        return False
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether offline data are used at all."""
+        return False
+
+    def prepare(self, progress_bar: bool) -> None:
+        """Choose and read the offline data, if any are used."""
+        if not self.wants_data or self.retrieved is not None:
+            return
+        if self.dataset is None:
+            warnings.warn(
+                f"{type(self).__name__} learns without offline data: pass dataset=", stacklevel=3
+            )
+            return
+        if self.progress.retrieved_of != self.dataset.fingerprint:
+            self.progress.retrieved_ids = self._related()
+            self.progress.retrieved_of = self.dataset.fingerprint
+        self.retrieved = ReplayBuffer()
+        for trajectory in self.dataset.subset(self.progress.retrieved_ids):
+            kept = trajectory if self.offline_rewards else replace(trajectory, reward=None)
+            self.retrieved.add(kept)
+
+    def _related(self) -> list[int]:
+        assert self.dataset is not None and self.env is not None
+        given, task = self.hyperparameters, self.hyperparameters.task
+        if task is None and self.env.has_attr("spec"):
+            task = getattr(self.env.get_attr("spec")[0], "id", None)
+        return related_trajectories(
+            self.dataset,
+            task,
+            given.embodiment,
+            self.policy.action_dim,
+            given.num_retrieve,
+            self.streams.numpy(Purpose.RETRIEVE, 0),
+        )
+
+    def draw(self, replay: ReplayBuffer, size: int, n_steps: int, stream: int = 0) -> Transitions:
+        """Draw the batch of the next update from some episodes; its images are shifted at random.
+
+        :param stream: another number for each batch of the same update
+        """
+        rng = np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
+        given = self.hyperparameters
+        shape = size, n_steps, given.gamma, self.policy.action_dim
+        return draw_transitions(replay.trajectories, *shape, rng, given.pad).to(self.device)
+
+    def hyperparameters_changed(self) -> None:
+        """Hand the keywords to the learner, and the learning rate to its optimisers."""
+        self.learner.given = self.hyperparameters
+        for optimizer in optimizers(self.learner).values():
+            for group in optimizer.param_groups:
+                group["lr"] = self.hyperparameters.learning_rate
+
+    def too_late(self, stage: Stage) -> str | None:
+        """Return the remedy if keywords of this stage can no longer take effect, else None."""
+        if stage is Stage.RETRIEVAL and self.retrieved is not None:
+            return "the offline data are chosen; call reset_task() first"
+        return super().too_late(stage)
+
+    def reset_task(self) -> None:
+        """Forget the task: episodes, offline data, the clone, and all networks."""
+        self.retrieved = None
+        self.progress.reset("retrieved_ids", "retrieved_of", "cloned")
+        super().reset_task()
+
+
+def descend(optimizer: Optimizer, loss: Tensor, name: str) -> None:
+    """Take one optimiser step, unless the loss is not finite.
+
+    :raises FloatingPointError: the loss is not finite; the weights are as before
+    """
+    if not loss.isfinite():
+        raise FloatingPointError(
+            f"The {name} loss is {loss.item()}; this step was not taken and the weights are as "
+            "before: look at the rewards or lower the learning rate"
+        )
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()

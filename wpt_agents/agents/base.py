@@ -201,6 +201,9 @@ class PixelAgent(BaseAlgorithm):
         actions = rng.uniform(-1, 1, (len(frames), width)) * self.policy.action_mask.cpu().numpy()
         return actions.astype(np.float32)
 
+    def before_step(self) -> None:
+        """Do what must come before each step that is collected, such as setting the noise."""
+
     def on_episode(self, trajectory: Trajectory) -> None:
         """Look at a finished episode before it is added to the replay buffer."""
 
@@ -351,6 +354,7 @@ class PixelAgent(BaseAlgorithm):
         go_on = True
         ended = False
         while go_on and not ended and self.num_timesteps < self._total_timesteps:
+            self.before_step()
             image, _ = to_images(self._last_obs)
             action = self.policy.to_env(rollout.act(image))
             meanwhile = self.update_models if self.hyperparameters.train_freq == "step" else None

@@ -55,6 +55,7 @@ def test_a_run_folder_of_version_0_1_is_read(earlier):
     assert len(results) == 1
 
 
+@pytest.mark.slow
 def test_a_run_killed_in_version_0_1_goes_on_from_its_checkpoint(earlier, monkeypatch, tmp_path):
     for name in ("interrupted", "finished"):
         shutil.copytree(earlier / name, tmp_path / name)

@@ -556,6 +556,7 @@ def test_datasets_of_equal_shapes_are_told_apart_whatever_their_codec(tmp_path):
         assert len(prints) == 2
 
 
+@pytest.mark.slow
 def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path):
     model = pretrained(store, env=DotEnv()).learn(LENGTH)
     model.save(tmp_path / "model")
@@ -635,6 +636,7 @@ def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
     assert WPT("WPTPolicy", size="debug").kickstart_schedule(0) == 0
 
 
+@pytest.mark.slow
 def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
     distances = []
     for kickstart in (0.0, 100.0):

@@ -89,6 +89,7 @@ def append_until_killed(path, acknowledged, seed):
             write(log, b".")
 
 
+@pytest.mark.slow
 def test_a_writer_killed_50_times_loses_at_most_what_it_was_writing(tmp_path, small_shards):
     path, acknowledged, kept = empty(tmp_path / "data"), tmp_path / "acknowledged", 0
     for seed in range(50):

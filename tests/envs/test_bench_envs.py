@@ -6,6 +6,8 @@ import pytest
 
 from wpt_agents.zoo.bench import envs
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 
 @pytest.mark.parametrize(
     ("task", "usual"), [("dmc-acrobot-swingup", "dm_control"), ("metaworld-reach", "gymnasium")]

@@ -10,6 +10,8 @@ import wpt_envs  # noqa: F401
 from scipy.stats import fisher_exact
 from wpt_envs import tasks
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 # task -> episodes of five with success at the last, and at any step, in metaworld 3.1.1 itself
 SCRIPTED = json.loads(
     (Path(__file__).parents[1] / "fixtures" / "scripted_policies.json").read_text()

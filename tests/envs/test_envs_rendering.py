@@ -13,6 +13,8 @@ import pytest
 import wpt_envs
 from wpt_envs import headless, measure, rendering
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 FAMILIES = [
     "dmc-cartpole-balance",
     "dmc-acrobot-swingup",

@@ -17,6 +17,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 from wpt_envs.wrappers import CheckAction, PadAction, RepeatAction, SeePixels
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 SUITES = ["dmc-walker-run", "metaworld-button-press", "robotics-fetch-push"]
 FAMILIES = [
     *SUITES,

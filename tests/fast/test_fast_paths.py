@@ -81,6 +81,7 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
         assert (weight - expected[name]).abs().mean() < 2e-5, name
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # at which torch looks
 def test_three_compiled_updates_are_those_of_the_definition(monkeypatch):
     monkeypatch.setattr(RSSM, "_scan", RSSM._filter)  # the way of a GPU

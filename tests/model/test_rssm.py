@@ -73,6 +73,7 @@ def slow_posterior(rssm, h, e):
     return slow_logits(rssm.post_out, x)
 
 
+@pytest.mark.slow
 def test_the_gru_is_the_slow_reference(rssm):
     state, action = some_state(), noise(B, A)
     with torch.no_grad():

@@ -275,6 +275,7 @@ def error(model, batch, context=5):
     return ((frames - batch.image[:, context:]) / 255).square().mean().item()
 
 
+@pytest.mark.slow
 def test_frame_t_plus_1_follows_from_action_t_and_from_no_other(trained):
     batch = windows(*(turn(12, 100 + seed) for seed in range(16)))
     right = error(trained, batch)

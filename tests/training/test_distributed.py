@@ -151,6 +151,7 @@ def test_run_is_refused_under_torchrun(monkeypatch, capsys):
 # ------------------------------------------------------------------------------ in two processes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", JOBS)
 def test_two_processes_learn_what_one_does(pair, alone, name):
     seen, after = torch.load(pair / f"{name}-0.pt")
@@ -199,6 +200,7 @@ def torchrun(*words):
     return done
 
 
+@pytest.mark.slow
 def test_processes_connect_again_after_they_parted_and_after_one_was_restarted():
     said = torchrun(
         "--max-restarts=1", Path(__file__).parents[1] / "helpers" / "restarted.py"
@@ -209,6 +211,7 @@ def test_processes_connect_again_after_they_parted_and_after_one_was_restarted()
     assert "rank 1, attempt 0, meeting 1" not in said
 
 
+@pytest.mark.slow
 def test_torchrun_pretrains_by_the_command_line_and_only_rank_0_speaks(folder, tmp_path):
     sizes = ["batch_size=2", "batch_length=4", "size=debug", "pretrain.steps=3"]
     options = ["--data", folder / "data", "--out", tmp_path, "--preset", "debug", "--device", "cpu"]

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from run_folders import make_run
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 TASK = "metaworld-reach"
 
 

@@ -36,6 +36,8 @@ from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.statistics import mean_interval
 from wpt_agents.zoo.terminal import console
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
 SECTIONS = {
     "env": {"action_repeat": 1, "rendering": "fast"},

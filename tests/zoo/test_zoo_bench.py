@@ -15,6 +15,8 @@ from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.commands.options import print_table
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 KEYS = {
     *("what", "size", "params", "batch", "length", "threads", "dtype", "median_s", "gflop"),
     *("gflop_per_s", "ceiling_gflop_per_s", "share_of_ceiling", "rss_mb"),

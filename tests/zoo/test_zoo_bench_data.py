@@ -6,6 +6,8 @@ import pytest
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.bench import data, formats
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 
 def test_every_case_of_the_quick_benchmark_has_its_row(tmp_path):
     rows = list(data.rows(quick=True, folder=tmp_path))

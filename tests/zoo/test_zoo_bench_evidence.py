@@ -8,6 +8,8 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.bench import exploration, retrieval
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 
 def states(*places):
     """Walker states of (height, pitch, speed)."""

@@ -9,6 +9,8 @@ from typer.testing import CliRunner
 from wpt_agents.zoo.bench import peers
 from wpt_agents.zoo.commands.app import app
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 
 @pytest.mark.parametrize("peer", peers.PEERS)
 @pytest.mark.filterwarnings("ignore")  # the peers' own

@@ -21,6 +21,8 @@ from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.judge import prediction
 from wpt_agents.zoo.pictures import predictions as prediction_pictures
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 PIXELS = 64 * 64 * 3
 
 

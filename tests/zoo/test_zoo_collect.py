@@ -18,6 +18,8 @@ from wpt_agents.zoo.collect.curious import Expedition, explore
 from wpt_agents.zoo.collect.episodes import record
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 gym.register("PlainDot-v0", entry_point="toy_env:DotEnv")
 gym.register("WideDot-v0", entry_point="toy_env:DotEnv", kwargs={"actions": 3})
 DOT, WIDE = f"{__name__}:PlainDot-v0", f"{__name__}:WideDot-v0"  # importable from a fresh process

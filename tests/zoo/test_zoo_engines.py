@@ -20,6 +20,8 @@ from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.watch import standing
 from wpt_agents.zoo.terminal import console
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 PLACES = os.pathsep.join(
     [str(Path(__file__).parents[1] / "helpers"), *filter(None, sys.path)]
 )  # for workers

@@ -28,6 +28,8 @@ from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.run.runner import run
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 CHANGES = {
     "learn": {"frames": 150, "checkpoint_every": 25},
     "evaluate": {"episodes": 2, "every": 25, "during_episodes": 2, "keep_best": True},

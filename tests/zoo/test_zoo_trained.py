@@ -23,6 +23,8 @@ from wpt_agents.zoo.judge.trained import find_trained
 from wpt_agents.zoo.report.hub import card, pull, push
 from wpt_agents.zoo.run.runner import run
 
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
 
 @pytest.fixture
 def moved(tmp_path):

@@ -82,6 +82,7 @@ def test_watching_ends_when_all_is_over_and_does_nothing_itself(tmp_path, monkey
     assert [path.name for path in folder.iterdir()] == ["error.txt"]
 
 
+@pytest.mark.slow
 def test_sb3s_plots_and_rl_zoos_layout_read_a_run(tmp_path):
     pytest.importorskip("pandas", reason="SB3's results_plotter needs pandas (the extra `dev`)")
     import matplotlib.pyplot as plt

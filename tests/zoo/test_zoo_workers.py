@@ -35,6 +35,7 @@ STARTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes through /proc")
 @pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
 def test_a_worker_ends_with_a_killed_parent(tmp_path, start):

@@ -188,9 +188,42 @@ def test_merge_refuses_nothing_and_other_sizes_before_it_writes(tmp_path):
     small, large = made(tmp_path / "1", chain(3)), TrajectoryDataset.create(tmp_path / "2")
     with pytest.raises(ValueError, match=r"one image size: .*1 has 8, .*2 has 64"):
         TrajectoryDataset.merge(tmp_path / "all", [small, large])
-    with pytest.raises(ValueError, match="none given"):
+    with pytest.raises(ValueError, match="got no dataset"):
         TrajectoryDataset.merge(tmp_path / "all", [])
     assert not (tmp_path / "all").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Images of 8 x 8 are resized")
+def test_merge_resizes_where_it_is_asked_to(tmp_path):
+    small, large = made(tmp_path / "1", chain(3)), TrajectoryDataset.create(tmp_path / "2")
+    merged = TrajectoryDataset.merge(tmp_path / "all", [small, large], image_size=64)
+    np.testing.assert_array_equal(merged[0].image, chain(3, size=64).image)
+
+
+def test_joined_datasets_are_read_as_one_and_nothing_is_copied(tmp_path):
+    one = made(tmp_path / "1", chain(9, 0), chain(4, 1), codec="raw")
+    two = made(tmp_path / "2", chain(7, 2, embodiment="arm"))
+    both = TrajectoryDataset.join([one.subset([1, 0]), two])
+    assert both.lengths.tolist() == [4, 9, 7]
+    assert both.embodiments == [None, None, "arm"]
+    for new, old in zip(both, (one[1], one[0], two[0]), strict=True):
+        np.testing.assert_array_equal(new.image, old.image)
+    check_chain(both.sample(8, 5, 2, rng()))
+    np.testing.assert_array_equal(both.subset([2])[0].image, two[0].image)
+    assert both.info()["codec"] == "raw, zstd" and both.info()["trajectories"] == 3
+    assert len({both.fingerprint, one.fingerprint, two.fingerprint}) == 3
+    with pytest.raises(ValueError, match="read-only"):
+        both.append(chain(3))
+    flip_bit(tmp_path / "2" / "shard-00000.bin", 20)
+    assert [damage.trajectory for damage in both.validate(set_aside=True)] == [2]
+    assert len(TrajectoryDataset.open(tmp_path / "2")) == 0
+    assert len(TrajectoryDataset.open(tmp_path / "1")) == 2
+
+
+def test_datasets_of_different_image_sizes_are_not_joined(tmp_path):
+    small, large = made(tmp_path / "1", chain(3)), TrajectoryDataset.create(tmp_path / "2")
+    with pytest.raises(ValueError, match=r"1 has 8, .*2 has 64; copy them by .*merge"):
+        TrajectoryDataset.join([small, large])
 
 
 def test_a_damaged_trajectory_is_not_copied(tmp_path):
@@ -387,12 +420,28 @@ def test_a_folder_with_something_in_it_is_not_written_over(tmp_path):
     assert len(TrajectoryDataset.open(tmp_path)) == 1
 
 
-def test_another_image_size_is_refused_and_nothing_is_written(tmp_path):
+def test_images_of_another_size_are_resized_with_one_warning(tmp_path):
     with TrajectoryDataset.create(tmp_path) as dataset:
-        with pytest.raises(ValueError, match="images of 64 x 64, got 8 x 8; resize"):
+        with pytest.warns(UserWarning, match="Images of 8 x 8 are resized to 64 x 64") as warned:
             dataset.append(chain(5))
+            dataset.append(chain(7))
         dataset.append(chain(5, size=64))
-    assert len(TrajectoryDataset.open(tmp_path)) == 1
+    assert len(warned) == 1
+    small, _, large = TrajectoryDataset.open(tmp_path)
+    np.testing.assert_array_equal(small.image, large.image)  # a flat colour stays what it is
+
+
+def test_the_advice_for_images_that_are_not_square_works_to_the_letter(tmp_path):
+    image = np.zeros((4, 8, 32, 3), np.uint8)
+    image[:, :, 12:20] = 200  # the square in the middle
+    wide = Trajectory(image, np.zeros((3, 2), np.float32))
+    with TrajectoryDataset.create(tmp_path, image_size=8) as dataset:
+        advice = r"squeezed to 8 x 8.* factor of 4\.00; .*image\[\.\.\., 0:8, 12:20, :\], or append"
+        with pytest.warns(UserWarning, match=advice):
+            dataset.append(wide)
+        dataset.append(replace(wide, image=image[..., 0:8, 12:20, :]))
+        dataset.append(wide, crop=True)
+    assert [int(t.image.mean()) for t in dataset] == [50, 200, 200]
 
 
 def test_padding_that_is_not_zero_is_refused(tmp_path):
@@ -573,6 +622,6 @@ def test_a_fork_that_inherits_the_threads_can_sample(tmp_path):
     made(tmp_path, chain(20))
     dataset = TrajectoryDataset.open(tmp_path, workers=2)
     dataset.sample(4, 9, 2, rng())
-    dataset._pool_owner = -1  # what a child sees: the threads belong to another process
+    dataset._threads._owner = -1  # what a child sees: the threads belong to another process
     check_chain(dataset.sample(4, 9, 2, rng()))
     dataset.close()

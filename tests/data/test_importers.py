@@ -16,9 +16,10 @@ from stable_baselines3.common.save_util import save_to_pkl
 from tensorboard.summary.writer.record_writer import RecordWriter
 from zoo_command import call
 
+from wpt_agents.data.convert import cache_folder
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.data.importers.convert import cache_folder, open_episodes, recognise
 from wpt_agents.data.importers.episodes import as_images, needs, rescaled
+from wpt_agents.data.importers.formats import open_episodes, recognise
 from wpt_agents.data.importers.npz import NpzEpisodes
 from wpt_agents.data.importers.sb3 import SB3Episodes
 from wpt_agents.data.trajectory import Trajectory

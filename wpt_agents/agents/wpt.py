@@ -33,8 +33,8 @@ from torch.optim.lr_scheduler import LinearLR
 from tqdm.auto import tqdm
 
 from wpt_agents.agents.official import export_model, import_model
+from wpt_agents.data.convert import Data
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.data.importers.convert import Data
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory

@@ -1,16 +1,92 @@
-"""Pictures of any size, made the size that a model sees."""
+"""Images of any size become images of the size that a model sees, by one function for all."""
+
+import warnings
+from functools import lru_cache
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+from torch import Tensor
+
+CHUNK = 64  # images that are converted to floats at once
 
 
 def resized(images: np.ndarray, size: int) -> np.ndarray:
-    """Bilinear, without aliasing; what is not square is squeezed.
+    """Resize images to a square by averaging over the area that each new pixel covers.
+
+    Images that are not square are squeezed. Averaging over areas is free of aliasing, and small
+    objects keep their share of brightness.
 
     :param images: (N, H, W, 3) uint8
     :return: (N, size, size, 3) uint8
     """
-    pixels = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float()
-    pixels = F.interpolate(pixels, (size, size), mode="bilinear", antialias=True)
-    return pixels.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
+    _, height, width, channels = images.shape
+    rows, columns = area_weights(height, size), area_weights(width, size)
+    parts = []
+    for at in range(0, len(images), CHUNK):
+        pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + CHUNK])).float()
+        count = len(pixels)
+        pixels = rows @ pixels.reshape(count, height, width * channels)
+        pixels = columns @ pixels.reshape(count, size, width, channels)
+        parts.append(pixels.round().clamp(0, 255).byte().numpy())
+    return np.concatenate(parts)
+
+
+@lru_cache(maxsize=32)
+def area_weights(old: int, new: int) -> Tensor:
+    """(new, old): the share of each old pixel in each new one along an axis; the rows sum to 1."""
+    edges = torch.arange(new + 1, dtype=torch.float64) * old / new
+    pixel = torch.arange(old, dtype=torch.float64)
+    overlap = torch.minimum(edges[1:, None], pixel + 1) - torch.maximum(edges[:-1, None], pixel)
+    return (overlap.clamp(min=0) * new / old).float()
+
+
+def middle_square(images: np.ndarray) -> np.ndarray:
+    """The square in the middle of each image: (N, H, W, 3) -> (N, S, S, 3) with S = min(H, W)."""
+    height, width = images.shape[1:3]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    return images[:, top : top + side, left : left + side]
+
+
+def resize_message(height: int, width: int, size: int, crop_option: str = "") -> str:
+    """The sentence to say when images are resized, with a crop that keeps their proportions.
+
+    :param crop_option: how to have the middle cut out, if the caller has an option for it
+    """
+    if height == width:
+        return f"Images of {height} x {width} are resized to {size} x {size}"
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    cut = f"image[..., {top}:{top + side}, {left}:{left + side}, :]"
+    ratio = max(height, width) / side
+    return (
+        f"Images of {height} x {width} are squeezed to {size} x {size}, which distorts shapes by a "
+        f"factor of {ratio:.2f}; to keep the proportions, cut the middle out first: {cut}"
+        + (f", or {crop_option}" if crop_option else "")
+    )
+
+
+class Resizer:
+    """Brings images to one size, and warns once for each shape that comes.
+
+    :param size: height and width of the result
+    :param crop: cut out the middle square instead of squeezing
+    :param crop_option: how a user asks for `crop`, for the warning
+    """
+
+    def __init__(self, size: int, crop: bool = False, crop_option: str = "") -> None:
+        self.size, self.crop, self._crop_option = size, crop, crop_option
+        self._warned: set[tuple[int, int]] = set()
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """(N, H, W, 3) uint8 -> (N, size, size, 3) uint8."""
+        if self.crop:
+            images = middle_square(images)
+        height, width = images.shape[1:3]
+        if (height, width) == (self.size, self.size):
+            return np.ascontiguousarray(images)
+        if (height, width) not in self._warned:
+            self._warned.add((height, width))
+            message = resize_message(height, width, self.size, self._crop_option)
+            warnings.warn(message, stacklevel=3)
+        return resized(images, self.size)

@@ -19,6 +19,7 @@ from pathlib import Path
 from wpt_agents.files.archive import replacing
 
 KIND, VERSION = "wpt_agents.TrajectoryDataset", 1
+CONVERT_LOCK = "convert.lock"  # an empty file, locked by the process that converts into a cache
 
 Place = tuple[int, int]  # shard and offset, by which a trajectory is known for good
 
@@ -83,12 +84,13 @@ def create_folder(path: Path, meta: Meta) -> None:
         )
     (path / "index.jsonl").touch()
     with replacing(path / "meta.json") as temporary:
-        temporary.write_text(json.dumps({"kind": KIND, "version": VERSION, **asdict(meta)}))
+        head = {"kind": KIND, "version": VERSION, **asdict(meta)}
+        temporary.write_text(json.dumps(head), encoding="utf-8")
 
 
 def _left_by_create(file: Path) -> bool:
     """Whether the file is all that a `create_folder` killed halfway can have left."""
-    empty = file.name == "index.jsonl" and file.stat().st_size == 0
+    empty = file.name in ("index.jsonl", CONVERT_LOCK) and file.stat().st_size == 0
     return empty or file.name.startswith(".meta.json.tmp-")
 
 
@@ -98,7 +100,7 @@ def read_meta(path: Path) -> Meta:
     :raises ValueError: no dataset there, or one of a newer version
     """
     try:
-        meta = json.loads((path / "meta.json").read_text())
+        meta = json.loads((path / "meta.json").read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError) as error:
         state = f"damaged ({error})" if isinstance(error, json.JSONDecodeError) else "missing"
         what = f"is not a dataset: meta.json is {state}" if path.exists() else "does not exist"
@@ -150,7 +152,7 @@ def read_damaged(path: Path) -> dict[Place, str]:
     :raises ValueError: the list itself is damaged
     """
     try:
-        found = json.loads((path / "damaged.json").read_text())
+        found = json.loads((path / "damaged.json").read_text(encoding="utf-8"))
         return {(item["shard"], item["at"]): item["reason"] for item in found}
     except FileNotFoundError:
         return {}
@@ -166,7 +168,7 @@ def add_damaged(path: Path, places: Mapping[Place, str]) -> None:
     known = {**read_damaged(path), **places}
     items = [{"shard": k[0], "at": k[1], "reason": known[k]} for k in sorted(known)]
     with replacing(path / "damaged.json") as temporary:
-        temporary.write_text(json.dumps(items, indent=1))
+        temporary.write_text(json.dumps(items, indent=1), encoding="utf-8")
 
 
 def undamaged(path: Path, entries: Sequence[Entry]) -> list[Entry]:

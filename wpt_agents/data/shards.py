@@ -24,6 +24,7 @@ from wpt_agents.data.codecs import find_codec
 from wpt_agents.data.index import Entry, Meta, read_index, undamaged
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.archive import sync_folder
+from wpt_agents.files.locks import lock, unlock
 
 BLOCK = 16  # steps; longer compresses little better and makes a window's edges dearer
 SHARD_BYTES = 256 * 2**20
@@ -107,7 +108,7 @@ class Writer:
         self._path, self._meta = path, meta
         self._index = FileIO(path / "index.jsonl", "rb+")
         try:
-            _lock(self._index.fileno())
+            lock(self._index.fileno())
             entries, end = read_index(path)
             self.entries = undamaged(path, entries)
             self._index.truncate(end)
@@ -179,7 +180,7 @@ class Writer:
         """Gives the right to write back."""
         self.flush()
         self._shard.close()
-        _unlock(self._index.fileno())
+        unlock(self._index.fileno())
         self._index.close()
 
     def _open_shard(self, number: int, end: int) -> FileIO:
@@ -198,15 +199,3 @@ def _write(descriptor: int, data: bytes | memoryview) -> int:
     while rest:  # a disk that fills up takes a part, then raises
         rest = rest[os.write(descriptor, rest) :]
     return len(data)
-
-
-def _lock(descriptor: int) -> None:
-    import fcntl  # the kernel takes the lock back when the writer dies
-
-    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _unlock(descriptor: int) -> None:
-    import fcntl  # closing is not enough where a forked process holds the file open, too
-
-    fcntl.flock(descriptor, fcntl.LOCK_UN)

@@ -60,7 +60,9 @@ def save_arrays(
         archive.writestr("about.json", json.dumps(head))
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+                np.lib.format.write_array(  # type: ignore[no-untyped-call]
+                    member, array, allow_pickle=False
+                )
 
 
 def load_arrays(
@@ -79,7 +81,9 @@ def load_arrays(
             for name in archive.namelist():
                 if name.endswith(".npy"):
                     with archive.open(name) as member:
-                        arrays[name[:-4]] = np.lib.format.read_array(member, allow_pickle=False)
+                        arrays[name[:-4]] = np.lib.format.read_array(  # type: ignore[no-untyped-call]
+                            member, allow_pickle=False
+                        )
     except (zipfile.BadZipFile, KeyError, EOFError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} is damaged or not a {kind} of version {VERSION} ({error}); make it again"

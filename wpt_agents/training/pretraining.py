@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wpt_agents.data.importers.convert import Data
+from wpt_agents.data.convert import Data
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.networks import Size

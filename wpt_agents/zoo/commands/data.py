@@ -116,7 +116,7 @@ def import_data(
     Example: `python -m wpt_agents.zoo import npz exorl/walker data/walker --embodiment walker`
     """
     from wpt_agents.data.dataset import TrajectoryDataset
-    from wpt_agents.data.importers.convert import open_episodes
+    from wpt_agents.data.importers.formats import open_episodes
 
     given: dict[str, Any] = {
         "image_key": image_key,

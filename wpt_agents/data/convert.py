@@ -1,0 +1,171 @@
+"""From anything that can serve as a dataset to a dataset: `open_dataset`, and the conversions.
+
+This module stands above `TrajectoryDataset` and fills its doors in (`TrajectoryDataset.of`,
+`.from_npz`, ...): the class itself knows no other format.
+"""
+
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer as SB3Buffer
+
+from wpt_agents.data.dataset import Source, TrajectoryDataset
+from wpt_agents.data.importers.episodes import Episodes
+from wpt_agents.data.importers.formats import FORMATS, open_episodes, recognise
+from wpt_agents.data.importers.minari import local_minari
+from wpt_agents.data.importers.sb3 import SB3Episodes
+from wpt_agents.data.index import CONVERT_LOCK
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.locks import locked
+
+One = Source | TrajectoryDataset | SB3Buffer | ReplayBuffer | Episodes | Trajectory
+Data = One | Sequence[One] | Iterable[Trajectory]
+
+
+def open_dataset(data: Data) -> TrajectoryDataset:
+    """Open whatever can serve as a dataset.
+
+    - a dataset, or the path of one: the dataset itself;
+    - a path in one of `FORMATS`, or a local Minari dataset's name: converted once, into the cache
+      (see `cache_folder`); a conversion that was cut short goes on;
+    - replay buffers, a Trajectory, or any iterable of them: stored in a temporary folder;
+    - a list of any of these: a view of all as one dataset.
+
+    :raises ValueError: anything else; the message says what it is and what to do
+    """
+    if isinstance(data, TrajectoryDataset):
+        return data
+    if isinstance(data, str | os.PathLike):
+        return _open_path(data)
+    if isinstance(data, SB3Buffer):
+        return _stored(SB3Episodes(data))
+    if isinstance(data, ReplayBuffer):
+        return _stored(data.trajectories)
+    if isinstance(data, Trajectory):
+        return _stored([data])
+    items = list(data) if isinstance(data, Sequence) else data
+    if isinstance(items, list) and any(not isinstance(item, Trajectory) for item in items):
+        return TrajectoryDataset.join([open_dataset(item) for item in items])
+    return _stored(cast(Iterable[Trajectory], items))
+
+
+def _stored(trajectories: Iterable[Trajectory]) -> TrajectoryDataset:
+    """A dataset in a temporary folder, which is removed with it."""
+    dataset = TrajectoryDataset.create(tempfile.mkdtemp(prefix="wpt_dataset_"))
+    weakref.finalize(dataset, shutil.rmtree, dataset.path, ignore_errors=True)
+    with dataset:
+        dataset.extend(trajectories)
+    return dataset
+
+
+def _open_path(source: Source) -> TrajectoryDataset:
+    source = os.path.expanduser(source)
+    form = recognise(source)
+    if form is None:
+        return TrajectoryDataset.open(source)
+    folder = cache_folder(source)
+    # Of several processes that start at once, one converts; the others wait and find it done.
+    with locked(folder / CONVERT_LOCK):
+        return from_episodes(open_episodes(source, form), folder, progress_bar=True)
+
+
+def from_episodes(
+    episodes: Episodes, path: Source, progress_bar: bool = False
+) -> TrajectoryDataset:
+    """Append the episodes to the dataset at `path`; a conversion that was cut short goes on.
+
+    :raises ValueError: the dataset there does not begin with these episodes, or an episode cannot
+        be converted; those before it are kept
+    """
+    from tqdm.auto import tqdm
+
+    dataset = TrajectoryDataset.open_or_create(path, episodes.image_size)
+    done = dataset.appended
+    known = done > 0 and len(dataset) == done  # otherwise the last one may be set aside
+    if done > len(episodes) or (known and not _same(dataset, episodes[done - 1])):
+        raise ValueError(
+            f"{path} holds {done} trajectories of another source or with other labels; "
+            "convert to another folder"
+        )
+    bar = tqdm(
+        total=len(episodes),
+        initial=done,
+        desc="convert",
+        unit=" episodes",
+        mininterval=0.2 if sys.stderr.isatty() else 10,
+        disable=not progress_bar or done == len(episodes),
+    )
+    with dataset, bar:
+        for i in range(done, len(episodes)):
+            dataset.append(episodes[i])
+            bar.update()
+    return dataset
+
+
+def _same(dataset: TrajectoryDataset, read: Trajectory) -> bool:
+    """Whether a dataset's last trajectory is `read`; different sources may have the same names."""
+    stored = dataset[-1]
+    return (
+        _label(stored) == _label(read)
+        and np.array_equal(stored.action, read.action[:, : read.action_dim])
+        and stored.image.shape == read.image.shape
+        and (not dataset.lossless or np.array_equal(stored.image, read.image))
+    )
+
+
+def _label(trajectory: Trajectory) -> tuple[Any, ...]:
+    rewarded = trajectory.reward is not None
+    return trajectory.source, trajectory.embodiment, trajectory.task, rewarded
+
+
+def cache_folder(source: Source) -> Path:
+    """The folder for the conversion of `source`; another one as soon as a file of it changes.
+
+    It is in `$XDG_CACHE_HOME/wpt_agents`, or `~/.cache/wpt_agents`; its content may be deleted.
+    """
+    path = Path(source).resolve() if Path(source).exists() else local_minari(os.fspath(source))
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256(os.fsencode(path))
+    for file in files:
+        stat = file.stat()
+        digest.update(f"{file.name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "wpt_agents" / f"{path.name}-{digest.hexdigest()[:16]}"
+
+
+def convert(
+    source: Source | SB3Buffer,
+    path: Source,
+    progress_bar: bool = False,
+    form: str | None = None,
+    **options: Any,
+) -> TrajectoryDataset:
+    """Convert other people's data at `source` into a dataset at `path`.
+
+    :param form: a name in `FORMATS`; recognised by default
+    :param options: keywords of the format's reader, such as `image_key` or `low` and `high`
+    """
+    return from_episodes(open_episodes(source, form, **options), path, progress_bar)
+
+
+def _door(form: str) -> Callable[..., TrajectoryDataset]:
+    door = partial(convert, form=form)
+    door.__doc__ = f"Convert `{form}` data; `{FORMATS[form].__name__}` has the options."
+    return door
+
+
+# The doors of `TrajectoryDataset`, which is below this module.
+TrajectoryDataset.of = staticmethod(open_dataset)
+TrajectoryDataset.from_episodes = staticmethod(from_episodes)
+for _form in FORMATS:
+    setattr(TrajectoryDataset, f"from_{_form}", staticmethod(_door(_form)))

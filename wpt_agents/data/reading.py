@@ -1,0 +1,219 @@
+"""Stored trajectories as a reader sees them: by number, by sequence, or by batch."""
+
+import hashlib
+from collections.abc import Generator, Iterator, Sequence
+from typing import Self
+
+import numpy as np
+
+from wpt_agents.data.codecs import find_codec
+from wpt_agents.data.folder import Folder
+from wpt_agents.data.index import Entry
+from wpt_agents.data.threads import Threads, prefetched
+from wpt_agents.data.trajectory import Batch, Trajectory
+from wpt_agents.data.windows import Piece, Windows, make_batch
+
+
+class StoredTrajectories:
+    """Trajectories in one folder or several; only their index is kept in memory.
+
+    :param folders: all with images of one size
+    :param entries: the index's lines, in the order of the trajectories
+    :param folder_of: for each trajectory, the number of its folder; all are in the first if None
+    :param ids: the number of each trajectory in its own folder, for a read-only view
+    :param workers: threads that decompress; they pay off only where cores are free
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[Folder],
+        entries: list[Entry],
+        folder_of: Sequence[int] | None = None,
+        ids: Sequence[int] | None = None,
+        workers: int = 0,
+    ) -> None:
+        self._folders = list(folders)
+        self._entries = entries
+        self._folder_of = folder_of
+        self._ids = ids
+        self._whole: object = None  # what a view must keep alive: a temporary folder's dataset
+        self._windows: Windows | None = None
+        self._threads = Threads(workers)
+
+    def __len__(self) -> int:
+        """The number of trajectories."""
+        return len(self._entries)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        """Trajectory `i`, whole, its actions `action_dim` wide.
+
+        :raises ValueError: it is damaged
+        """
+        entry = self._entries[i]
+        part, _, _ = self._read((i % len(self), 0, entry.length + 1))
+        return Trajectory(**vars(part))
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def workers(self) -> int:
+        """The number of threads that decompress."""
+        return self._threads.workers
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """(N,) int, the number of actions of each trajectory."""
+        return np.array([entry.length for entry in self._entries], np.int64)
+
+    @property
+    def action_dims(self) -> np.ndarray:
+        """(N,) int, the true action width of each trajectory."""
+        return np.array([entry.action_dim for entry in self._entries], np.int64)
+
+    @property
+    def embodiments(self) -> list[str | None]:
+        """The robots' names, None where unknown."""
+        return [entry.embodiment for entry in self._entries]
+
+    @property
+    def tasks(self) -> list[str | None]:
+        """The task of each trajectory, None where unknown."""
+        return [entry.task for entry in self._entries]
+
+    @property
+    def sources(self) -> list[str | None]:
+        """Where each trajectory comes from, None where unknown."""
+        return [entry.source for entry in self._entries]
+
+    @property
+    def max_action_dim(self) -> int:
+        """The widest embodiment's action width, 0 without trajectories."""
+        return max((entry.action_dim for entry in self._entries), default=0)
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of the images."""
+        return self._folders[0].meta.image_size
+
+    @property
+    def lossless(self) -> bool:
+        """Whether images are read exactly as they were appended."""
+        return all(find_codec(folder.meta.codec).lossless for folder in self._folders)
+
+    @property
+    def is_subset(self) -> bool:
+        """Whether this is a read-only view: a subset, or several datasets joined."""
+        return self._ids is not None
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of the trajectories and their order; a retrieval index keeps its dataset's."""
+        digest = hashlib.sha256()
+        for e in self._entries:
+            checksum = "" if e.checksum is None else f" {e.checksum}"
+            digest.update(f"{e.shard} {e.at} {e.length} {e.blocks}{checksum}\n".encode())
+        return digest.hexdigest()
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> Self:
+        """A read-only view of some trajectories, in the order of `indices`.
+
+        :param indices: their numbers, or a mask: a bool for each trajectory
+        :raises ValueError: a mask of another length
+        """
+        chosen = np.asarray(indices, None if len(indices) else int)
+        if chosen.dtype == bool:
+            if len(chosen) != len(self):
+                raise ValueError(f"A mask of {len(chosen)} for {len(self)} trajectories")
+            chosen = np.flatnonzero(chosen)
+        entries = [self._entries[i] for i in chosen]
+        ids = [self._id(i) for i in chosen]
+        of = None if self._folder_of is None else [self._folder_of[i] for i in chosen]
+        view = type(self)(self._folders, entries, of, ids, self.workers)
+        view._whole = self
+        return view
+
+    def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
+        """The first image of every trajectory, in order: (n, S, S, 3) uint8 with n <= `batch`."""
+        for at in range(0, len(self), batch):
+            chunk = range(at, min(at + batch, len(self)))
+            yield np.stack(list(self._threads.map(self._first_image, chunk)))
+
+    def _first_image(self, i: int) -> np.ndarray:
+        image: np.ndarray = self._read((i, 0, 1))[0].image[0]
+        return image.copy()  # a view would keep its whole block in memory
+
+    def sample(
+        self,
+        batch_size: int,
+        length: int,
+        action_width: int | None = None,
+        rng: np.random.Generator | None = None,
+        share: slice = slice(None),
+    ) -> Batch:
+        """Draw sequences by the rule of `wpt_agents.data.windows`; `rng` alone decides which.
+
+        :param action_width: the width of the batch's actions; `max_action_dim` by default
+        :param rng: other sequences at every call by default
+        :param share: the rows that are read, for one of several processes
+        :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
+            `action_width`
+        """
+        if not self._entries:
+            path = self._folders[0].path
+            raise ValueError(f"{path} holds no trajectory; append some before sampling")
+        if self._windows is None:
+            self._windows = Windows(self.lengths)
+        rows = self._windows.draw(batch_size, length, rng or np.random.default_rng())[share]
+        action_width = self.max_action_dim if action_width is None else action_width
+        shape = (self.image_size, self.image_size, 3)
+        return make_batch(rows, self._read, shape, action_width, self._threads.map)
+
+    def batches(
+        self,
+        batch_size: int,
+        length: int,
+        action_width: int,
+        seed: int,
+        purpose: int = 0,
+        start: int = 0,
+        ahead: int = 2,
+        pin: bool = False,
+        share: slice = slice(None),
+    ) -> Generator[Batch, None, None]:
+        """Yield batches without end; batch k is a function of (seed, purpose, k) alone.
+
+        :param purpose: a different number for each use that shares the seed
+        :param start: the number of the first batch
+        :param ahead: how many are prepared in the background
+        :param pin: put them into pinned memory, from which a GPU copies while it computes
+        :param share: the rows of each batch that are read, for one of several processes
+        """
+
+        def draw(k: int) -> Batch:
+            rng = np.random.default_rng([seed, purpose, k])
+            batch = self.sample(batch_size, length, action_width, rng, share)
+            return batch.pin() if pin else batch
+
+        return prefetched(draw, start, ahead)
+
+    def _folder(self, i: int) -> Folder:
+        return self._folders[0 if self._folder_of is None else self._folder_of[i]]
+
+    def _id(self, i: int) -> int:
+        """The number of trajectory `i` in its own folder."""
+        return int(i) % len(self) if self._ids is None else self._ids[i]
+
+    def _read(self, piece: Piece) -> tuple[Trajectory, int, int]:
+        """Read the blocks that a piece lies in, as a trajectory, and the piece's place therein."""
+        i, start, stop = piece
+        try:
+            return self._folder(i).read(self._entries[i], start, stop)
+        except OSError as error:
+            raise self._damaged(i, error) from error
+
+    def _damaged(self, i: int, error: OSError) -> ValueError:
+        return ValueError(
+            f"Trajectory {self._id(i)} of {self._folder(i).path} is damaged: {error}. `validate` "
+            "lists all that are, `validate(set_aside=True)` leaves them out"
+        )

@@ -41,8 +41,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_v
 from torch import Tensor
 
 from wpt_agents.agents.attributes import declare
+from wpt_agents.data.convert import Data
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.data.importers.convert import Data
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.model_file import read_model

@@ -8,7 +8,8 @@ import torch
 from gymnasium import spaces
 from plain import Adam, assert_close, batch_of, encode, parameters, trunk, two_layers
 
-from wpt_agents.agents.rlpd import RLPDLearner, RLPDPolicy
+from wpt_agents.agents.rlpd import RLPDKeywords, RLPDLearner, RLPDPolicy
+from wpt_agents.training.model_files import optimizers
 
 IMAGES = spaces.Box(0, 255, (64, 64, 3), np.uint8)
 STRIDES, RATE, TAU, BETA = (2, 2, 2, 2), 1e-3, 0.1, 0.7
@@ -23,7 +24,7 @@ def policy_of(heads=0, actions=2):
 
 
 def learner_of(policy):
-    return RLPDLearner(policy, RATE, TAU, BETA)
+    return RLPDLearner(policy, RLPDKeywords(learning_rate=RATE, tau=TAU, beta=BETA))
 
 
 def copies(module):
@@ -134,8 +135,7 @@ def test_each_loss_moves_its_own_networks():
     policy = policy_of(HEADS)
     learner, seen = learner_of(policy), {}
     names = "encoder", "critic", "actor", "reward_ensemble"
-    for name in learner.optimizers:
-        optimizer = getattr(learner, name)
+    for name, optimizer in optimizers(learner).items():
         step = optimizer.step
 
         def recorded(step=step, name=name):

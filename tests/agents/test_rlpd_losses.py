@@ -7,17 +7,15 @@ import torch.nn.functional as F
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
+from wpt_agents.agents.optimistic import optimistic_reward, reward_ensemble_loss
 from wpt_agents.agents.rlpd import (
-    TanhActor,
     actor_loss,
     critic_loss,
-    optimistic_reward,
-    reward_ensemble_loss,
-    tanh_sample,
     td_target,
     temperature_loss,
 )
 from wpt_agents.model.ensembles import CriticEnsemble, RewardEnsemble
+from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
 
 
 def test_a_critic_of_the_ensemble_equals_the_layers_written_out():

@@ -140,6 +140,12 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             self.progress.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
         for trajectory in self.dataset.subset(self.progress.retrieved_ids):
+            if self.offline_rewards and trajectory.reward is None:
+                self.retrieved = None
+                raise ValueError(
+                    f"The dataset {self.dataset.path} holds trajectories without rewards, which "
+                    "label='true' needs: pass label='zero' or label='optimistic'"
+                )
             kept = trajectory if self.offline_rewards else replace(trajectory, reward=None)
             self.retrieved.add(kept)
 

@@ -5,64 +5,31 @@ zero, https://arxiv.org/abs/2202.01741) or ExPLORe (an optimistic reward model's
 https://arxiv.org/abs/2311.05067).
 """
 
-import math
 from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-import torch.nn.functional as F
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
 from torch.optim import Adam
 
-from wpt_agents.agents.frame_agent import descend
-from wpt_agents.data.transitions import Transitions
+from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, descend
+from wpt_agents.agents.optimistic import label
+from wpt_agents.data.transitions import Transitions, concatenate
 from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.ensembles import CriticEnsemble, RewardEnsemble
 from wpt_agents.model.frame_policy import FramePolicy
-from wpt_agents.model.frames import FrameEncoder, Trunk, mlp, xavier
+from wpt_agents.model.frames import FrameEncoder, xavier
 from wpt_agents.model.networks import Size, frozen
+from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
+from wpt_agents.training.keywords import Stage, amount, choice, count, share
+from wpt_agents.training.randomness import Purpose
 
-LOG_STD = -20.0, 2.0  # bounds of the policy's log standard deviation
-SHOWN = 0.8  # share of the online rows that each reward head learns from
-
-
-class TanhActor(nn.Module):
-    """π(a | h) = tanh of a Gaussian: a trunk of its own, then an MLP to mean and log std.
-
-    :param embed_dim: E, the width of the encoder's output
-    :param features: width of the trunk's latent
-    :param hidden: width of the MLP
-    :param action_dim: A
-    """
-
-    def __init__(self, embed_dim: int, features: int, hidden: int, action_dim: int) -> None:
-        super().__init__()
-        self.trunk = Trunk(embed_dim, features)
-        self.layers = mlp(features, hidden, 2 * action_dim)
-
-    def forward(self, embed: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, E) -> mean and log std of the Gaussian before tanh, (N, A) each."""
-        mean, log_std = self.layers(self.trunk(embed)).chunk(2, -1)
-        return mean, log_std.clamp(*LOG_STD)
-
-
-def tanh_sample(
-    mean: Tensor, log_std: Tensor, generator: Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """Action a = tanh(u), u = μ + σ ε, and log π(a) = Σ log N(u; μ, σ²) - log(1 - tanh² u).
-
-    log(1 - tanh² u) = 2 (log 2 - u - softplus(-2 u)), which does not overflow.
-
-    :param mean: (N, A)
-    :param log_std: (N, A)
-    :return: (N, A) and (N,)
-    """
-    noise = torch.randn(mean.shape, device=mean.device, generator=generator)
-    u = mean + log_std.exp() * noise
-    normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-    correction = 2 * (math.log(2) - u - F.softplus(-2 * u))
-    return u.tanh(), (normal - correction).sum(-1)
+LABELS = ("true", "zero", "optimistic")
 
 
 def td_target(reward: Tensor, discount: Tensor, next_q: Tensor) -> Tensor:
@@ -108,29 +75,39 @@ def temperature_loss(log_alpha: Tensor, log_prob: Tensor, target_entropy: float)
     return log_alpha.exp() * (-log_prob.detach().mean() - target_entropy)
 
 
-def reward_ensemble_loss(prediction: Tensor, reward: Tensor, shown: Tensor) -> Tensor:
-    """E[(r_k(z) - r)²] over the rows that are shown to member k.
+@dataclass(frozen=True, kw_only=True)
+class RLPDKeywords(FrameKeywords):
+    """The keywords of `RLPD`; the defaults are those of its published code for pixels.
 
-    :param prediction: (K, N)
-    :param reward: (N,), the environment's
-    :param shown: (K, N) bool
+    Source: configs/rlpd_pixels_config.py of https://github.com/ikostrikov/rlpd.
     """
-    assert prediction.shape == shown.shape, (prediction.shape, shown.shape)
-    return ((prediction - reward).square() * shown).sum() / shown.sum().clamp_min(1)
 
-
-def optimistic_reward(prediction: Tensor, beta: float) -> tuple[Tensor, Tensor]:
-    """ExPLORe's label by an ensemble: r = mean_k r_k(z) + β std_k r_k(z).
-
-    The ensemble stands in the place of ExPLORe's random network distillation, as in appendix G of
-    the ICLR 2026 version of the WPT paper: its deviation is in units of reward.
-
-    :param prediction: (K, N)
-    :param beta: β
-    :return: the label and the bonus in it, β std, (N,) each
-    """
-    bonus = beta * prediction.std(0, correction=0)
-    return prediction.mean(0) + bonus, bonus
+    channels: int = count(32, "channels of the encoder's first layer, doubled by each", Stage.SIZE)
+    feature_dim: int = count(50, "width of the actor's and the critics' latent", Stage.SIZE)
+    hidden_dim: int = count(256, "width of the hidden layers of all heads", Stage.SIZE)
+    critics: int = count(10, "number of critics", Stage.SIZE)
+    label: str = choice(
+        "true",
+        LABELS,
+        "the rewards of offline data: 'true', as the dataset holds them; 'zero' (UDS); or "
+        "'optimistic' (ExPLORe), the mean of a reward ensemble and `beta` times its deviation",
+        Stage.SIZE,
+    )
+    reward_members: int = count(5, "reward heads of the label 'optimistic'", Stage.SIZE)
+    beta: float = amount(1.0, "weight of the deviation in the label 'optimistic'")
+    learning_rate: float = amount(3e-4, "learning rate of all networks")
+    tau: float = share(0.005, "share by which the target networks move in an update")
+    offline_ratio: float = share(0.5, "share of offline transitions in a batch; 0 for none")
+    update_every: int = count(1, "collected steps that pay for one update")
+    learning_starts: int = count(
+        1_000, "steps that are collected before the first update", Stage.ACTING, least=0
+    )
+    warmup_steps: int = count(
+        1_000,
+        "steps at the start that uniform random actions drive, to the end of the episode",
+        Stage.ACTING,
+        least=0,
+    )
 
 
 class RLPDPolicy(FramePolicy):
@@ -184,77 +161,55 @@ class RLPDLearner:
     """One update of encoder, critics, actor and temperature, and of the reward ensemble if any.
 
     :param policy: whose networks learn
-    :param learning_rate: of Adam, for all networks
-    :param tau: share by which the target networks move
-    :param beta: weight of the ensemble's deviation in `optimistic_reward`
+    :param given: learning rate, τ and β
     """
 
-    def __init__(
-        self, policy: RLPDPolicy, learning_rate: float, tau: float, beta: float = 1.0
-    ) -> None:
-        self.policy, self.tau, self.beta = policy, tau, beta
+    def __init__(self, policy: RLPDPolicy, given: RLPDKeywords) -> None:
+        self.policy = policy
+        self.given = given
+        learning_rate = given.learning_rate
         value = [*policy.encoder.parameters(), *policy.critic.parameters()]
         self.critic_optimizer = Adam(value, learning_rate, fused=True)
         self.actor_optimizer = Adam(policy.actor.parameters(), learning_rate, fused=True)
         self.temperature_optimizer = Adam([policy.log_alpha], learning_rate, fused=True)
-        self.optimizers = ["critic_optimizer", "actor_optimizer", "temperature_optimizer"]
         if policy.reward_members:
             heads = policy.reward_ensemble.parameters()
             self.reward_optimizer = Adam(heads, learning_rate, fused=True)
-            self.optimizers.append("reward_optimizer")
 
     def update(
         self, batch: Transitions, online: int, generator: Generator | None = None
     ) -> Mapping[str, Tensor]:
         """One step of every network.
 
-        :param batch: rows of the environment, then offline rows
+        :param batch: rows of the environment, then offline rows; images are shifted already
         :param online: how many rows are of the environment
         """
         policy = self.policy
-        with torch.no_grad():
-            next_embed = policy.encoder(batch.next_image)
-            mean, log_std = policy.actor(next_embed)
-            next_action, _ = tanh_sample(mean, log_std, generator)
-            member = torch.randint(
-                policy.critics, (), generator=generator, device=batch.reward.device
-            )
-            next_q = policy.target_critic(policy.target_encoder(batch.next_image), next_action)[
-                member
-            ]
-        reward, metrics = self._labelled(batch.reward, next_embed, online, generator)
+        next_q, latent = self._look_ahead(batch.next_image, generator)
+        reward = batch.reward
+        metrics: dict[str, Tensor] = {}
+        if policy.reward_members:
+            ensemble = policy.reward_ensemble, self.reward_optimizer
+            reward, metrics = label(*ensemble, reward, latent, online, self.given.beta, generator)
         embed = policy.encoder(batch.image)
         q = policy.critic(embed, batch.action)
         value_loss = critic_loss(q, td_target(reward, batch.discount, next_q))
         descend(self.critic_optimizer, value_loss, "critic")
         metrics |= self._update_actor(embed.detach(), generator)
-        ema_update(policy.target_encoder, policy.encoder, self.tau)
-        ema_update(policy.target_critic, policy.critic, self.tau)
+        ema_update(policy.target_encoder, policy.encoder, self.given.tau)
+        ema_update(policy.target_critic, policy.critic, self.given.tau)
         return metrics | {"train/critic_loss": value_loss.detach(), "train/q": q.detach().mean()}
 
-    def _labelled(
-        self, reward: Tensor, next_embed: Tensor, online: int, generator: Generator | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The rewards of all rows: the offline ones by the reward ensemble, where there is one.
-
-        Rewards belong to arriving, so the ensemble looks at the next image. It learns first.
-        """
+    @torch.no_grad()
+    def _look_ahead(self, next_image: Tensor, generator: Generator | None) -> tuple[Tensor, Tensor]:
+        """The value of o' by one random target critic, (N,), and the critics' latent, (N, Z)."""
         policy = self.policy
-        if not policy.reward_members:
-            return reward, {}
-        with torch.no_grad():
-            latent = policy.critic.trunk(next_embed)
-        prediction = policy.reward_ensemble(latent[:online])
-        draw = torch.rand(prediction.shape, device=reward.device, generator=generator)
-        loss = reward_ensemble_loss(prediction, reward[:online], draw < SHOWN)
-        descend(self.reward_optimizer, loss, "reward")
-        with torch.no_grad():
-            label, bonus = optimistic_reward(policy.reward_ensemble(latent[online:]), self.beta)
-        metrics = {"explore/reward_loss": loss.detach()}
-        if len(label):
-            metrics["explore/bonus_share"] = bonus.mean() / label.abs().mean().clamp_min(1e-8)
-            metrics["explore/bonus"] = bonus.mean()
-        return torch.cat([reward[:online], label]), metrics
+        embed = policy.encoder(next_image)
+        mean, log_std = policy.actor(embed)
+        action, _ = tanh_sample(mean, log_std, generator)
+        member = torch.randint(policy.critics, (), generator=generator, device=embed.device)
+        next_q = policy.target_critic(policy.target_encoder(next_image), action)
+        return next_q[member], policy.critic.trunk(embed)
 
     def _update_actor(self, embed: Tensor, generator: Generator | None) -> dict[str, Tensor]:
         """Actor and temperature on the encoder's output, which they do not train.
@@ -275,3 +230,70 @@ class RLPDLearner:
             "train/entropy": -log_prob.detach().mean(),
             "train/alpha": alpha,
         }
+
+
+class RLPD(FrameAgent, keywords=RLPDKeywords):
+    """Soft actor-critic from augmented pixels that takes half of each batch from offline data.
+
+    Example::
+
+        model = RLPD("CnnPolicy", "wpt/metaworld-drawer-open-v0", dataset="data/mw", label="zero")
+        model.learn(50_000)
+
+    The offline data are trajectories of the task, or else of the robot. Without a dataset, or with
+    `offline_ratio=0`, it is soft actor-critic with an ensemble of critics.
+
+    :param policy: "CnnPolicy"
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": RLPDPolicy}
+    saved_as = "RLPD"
+    policy: RLPDPolicy
+    learner: RLPDLearner
+    hyperparameters: RLPDKeywords
+    shape_keywords = "channels", "feature_dim", "hidden_dim", "critics", "label", "reward_members"
+
+    def make_policy(self) -> RLPDPolicy:
+        """Make the networks, as wide as the environment's actions."""
+        given = self.hyperparameters
+        return RLPDPolicy(
+            self.observation_space,
+            self.action_space,
+            channels=given.channels,
+            feature_dim=given.feature_dim,
+            hidden_dim=given.hidden_dim,
+            critics=given.critics,
+            reward_members=given.reward_members if given.label == "optimistic" else 0,
+        )
+
+    def make_learner(self) -> RLPDLearner:
+        """Make the optimisers."""
+        return RLPDLearner(self.policy, self.hyperparameters)
+
+    @property
+    def updates_per_step(self) -> float:
+        """How many updates a collected step pays for."""
+        return 1 / self.hyperparameters.update_every
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether offline data are used at all."""
+        return self.hyperparameters.offline_ratio > 0
+
+    @property
+    def offline_rewards(self) -> bool:
+        """Whether the rewards of offline data are used."""
+        return self.hyperparameters.label == "true"
+
+    def update(self, metrics: Metrics) -> None:
+        """Make one update on online and offline transitions."""
+        size = self.hyperparameters.batch_size
+        offline = round(size * self.hyperparameters.offline_ratio) if self.retrieved else 0
+        batch = self.draw(self.replay_buffer, size - offline, 1, stream=0)
+        if offline:
+            assert self.retrieved is not None
+            batch = concatenate([batch, self.draw(self.retrieved, offline, 1, stream=1)])
+        generator = self.streams.torch(Purpose.UPDATE, self.updates, self.device)
+        for name, value in self.learner.update(batch, size - offline, generator).items():
+            metrics[name].append(value)
+        self.updates += 1

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from wpt_agents.agents.base import PixelAgent
-from wpt_agents.data.importers.convert import Data
+from wpt_agents.data.convert import Data
 from wpt_agents.data.related import related_trajectories
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.transitions import Transitions, draw_transitions

@@ -6,6 +6,8 @@ import numpy as np
 import yaml
 from imageio.v3 import imwrite
 
+from wpt_agents.zoo.result import Result, Score, Variant, write_result
+
 PIXELS = np.zeros((8, 24, 3), np.uint8)
 
 
@@ -14,17 +16,23 @@ def make_run(out, task, seed=0, method="wpt", returns=(10.0, 20.0), frames=1000,
     folder = out / preset / method / f"{task}_{seed}"
     folder.mkdir(parents=True)
     metric = "return" if task.startswith("dmc") else "success"
-    result = {
-        **{"suite": task.split("-")[0], "task": task, "method": method, "preset": preset},
-        **{"seed": seed, "frames": frames, "steps": frames // 2, "metric": metric},
-        "scores": {
-            "nothing": score(np.zeros(2), metric),
-            "random": score(np.array([1.0, 2.0]), metric),
-            **({"prior actor": score(np.array([4.0, 5.0]), metric)} if method == "wpt" else {}),
-            "WPT": score(np.array(returns), metric),
-        },
-        **{"seconds": {"learn": 1.5, "evaluate": 0.5}, "commit": "0123456789ab"},
-    }
+    played = {"nothing": (0.0, 0.0), "random": (1.0, 2.0)}
+    if method == "wpt":
+        played["prior actor"] = 4.0, 5.0
+    played["last"] = returns
+    result = Result(
+        suite=task.split("-")[0],
+        task=task,
+        method=method,
+        variant=Variant.parse(preset),
+        seed=seed,
+        frames=frames,
+        steps=frames // 2,
+        metric=metric,
+        scores={name: score(values, metric) for name, values in played.items()},
+        seconds={"learn": 1.5, "evaluate": 0.5},
+        commit="0123456789ab",
+    )
     env = {"action_repeat": 2, "rendering": "near"}
     config = {"task": f"wpt/{task}-v0", "seed": seed, "env": env}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
@@ -42,16 +50,11 @@ def make_run(out, task, seed=0, method="wpt", returns=(10.0, 20.0), frames=1000,
     if method != "scratch":
         imwrite(folder / "retrieval.png", PIXELS)
     (folder / "policy.mp4").write_bytes(b"not really a video")
-    (folder / "result.json").write_text(json.dumps(result))
+    write_result(folder, result)
     return folder
 
 
 def score(returns, metric):
-    """A policy's entry in `result.json`; above 5 an episode is a success."""
-    successes = [bool(value > 5) for value in returns] if metric == "success" else []
-    mean = float(np.mean(returns))
-    return {
-        **{"returns": [float(value) for value in returns], "successes": successes},
-        **{"mean": mean, "low": mean - 1, "high": mean + 1},
-        "success_rate": float(np.mean(successes)) if successes else None,
-    }
+    """A policy's score; an episode whose return is above 5 is a success."""
+    successes = tuple(value > 5 for value in returns) if metric == "success" else ()
+    return Score(tuple(map(float, returns)), successes)

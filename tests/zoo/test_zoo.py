@@ -29,10 +29,13 @@ from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.plan.runs import Run, make_plan
+from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.report.folders import read_results
-from wpt_agents.zoo.run import runner, shared
+from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
+from wpt_agents.zoo.run import learning, runner, shared
 from wpt_agents.zoo.run.runner import run
+from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.statistics import mean_interval
 from wpt_agents.zoo.terminal import console
 
@@ -86,10 +89,11 @@ def test_a_run_leaves_everything_in_one_folder(tmp_path):
     pictures = {"learning_curve.png", "policy.mp4", "predictions.png", "retrieval.png"}
     assert logs | pictures | {"config.yaml", "model.zip", "result.json"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
-    assert list(result["scores"]) == ["nothing", "random", "prior actor", "WPT"]
-    assert all(len(score["returns"]) == 3 for score in result["scores"].values())
+    assert list(result.scores) == ["nothing", "random", "prior actor", "last"]
+    assert all(len(score.returns) == 3 for score in result.scores.values())
     assert yaml.safe_load((one.folder / "config.yaml").read_text()) == one.config()
-    assert json.loads((one.folder / "result.json").read_text()) == result
+    assert read_result(one.folder) == result
+    assert result.updates > 0 and result.cpu_seconds > 0 and len(result.model) == 12
 
 
 def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):
@@ -103,18 +107,18 @@ def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_runs(tmp_path, method):
     result = run(job(tmp_path, method))
-    assert np.isfinite(result["scores"]["WPT"]["mean"])
+    assert np.isfinite(result.final.mean)
     guided = method not in ("scratch", "pretrain-only", "no-guidance")
-    assert ("prior actor" in result["scores"]) == guided
-    assert ("pretrain" in result["seconds"]) == (method not in ("scratch", "no-pretrain"))
+    assert ("prior actor" in result.scores) == guided
+    assert ("pretrain" in result.seconds) == (method not in ("scratch", "no-pretrain"))
     retrieved = (job(tmp_path, method).folder / "retrieval.png").exists()
     assert retrieved == (method not in ("scratch", "pretrain-only", "random-retrieval"))
 
 
 def test_an_environment_beside_the_learner_changes_nothing_but_the_time(tmp_path, monkeypatch):
-    made, before = [], runner.make_vec_env
+    made, before = [], learning.make_vec_env
     monkeypatch.setattr(
-        runner, "make_vec_env", lambda *a, **k: made.append(before(*a, **k)) or made[-1]
+        learning, "make_vec_env", lambda *a, **k: made.append(before(*a, **k)) or made[-1]
     )
     reach, scores = TASKS["wpt/metaworld-reach-v0"], []
     wpt = {"train_freq": "step", "max_action_dim": 4, "train_ratio": 1}
@@ -127,7 +131,7 @@ def test_an_environment_beside_the_learner_changes_nothing_but_the_time(tmp_path
             evaluate={"episodes": 1},
             wpt=wpt,
         )
-        scores.append(run(replace(one, task=reach))["scores"])
+        scores.append(run(replace(one, task=reach)).scores)
     assert [type(venv) for venv in made] == [SubprocVecEnv, DummyVecEnv]
     assert scores[0] == scores[1]
     beside, alone = (
@@ -146,8 +150,8 @@ def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
     done = (job(tmp_path).folder / "result.json").stat().st_mtime_ns
     assert run(job(tmp_path)) == first
     assert (job(tmp_path).folder / "result.json").stat().st_mtime_ns == done
-    monkeypatch.setattr(runner, "_work", lambda job: {"scores": "anew"})
-    assert run(job(tmp_path), force=True) == {"scores": "anew"}
+    monkeypatch.setattr(runner, "do_stages", lambda job: "done again")
+    assert run(job(tmp_path), force=True) == "done again"
 
 
 def test_a_second_seed_reuses_data_model_and_index_and_says_so(tmp_path, monkeypatch, capsys):
@@ -172,7 +176,7 @@ def test_a_change_of_fine_tuning_keeps_the_pretrained_model_and_others_do_not(tm
 
 
 def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
-    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
     one = job(tmp_path, data=own)
     assert one.shared.model_path != job(tmp_path).shared.model_path
     run(one)
@@ -183,7 +187,7 @@ def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
 
 
 def test_a_run_goes_on_with_the_same_data_alone(tmp_path):
-    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
     run(job(tmp_path, data=own))
     with TrajectoryDataset.open(own) as dataset:
         dataset.append(dataset[0])
@@ -192,10 +196,10 @@ def test_a_run_goes_on_with_the_same_data_alone(tmp_path):
 
 
 def test_the_datas_name_is_as_it_was_written_wherever_a_run_is_done(tmp_path, monkeypatch):
-    job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
     monkeypatch.chdir(tmp_path)
     one = replace(job(tmp_path, data=Path("own")), data_name="own")
-    assert replace(one, data=one.data.resolve()).label == one.label == "toy data=own"
+    assert str(replace(one, data=one.data.resolve()).variant) == str(one.variant) == "toy data=own"
 
 
 def test_a_failure_whose_words_look_like_markup_ends_one_run_and_not_all(
@@ -214,14 +218,14 @@ def test_a_failure_whose_words_look_like_markup_ends_one_run_and_not_all(
 def test_without_git_a_run_is_of_no_commit(monkeypatch):
     monkeypatch.setattr("shutil.which", lambda _: None)
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("asked git"))
-    assert runner.commit.__wrapped__() is None
+    assert commit.__wrapped__() is None
 
 
 def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):
-    own = job(tmp_path).shared.data().path
-    job(tmp_path, data=own).shared.data()
+    own = collect_data(job(tmp_path).shared).path
+    collect_data(job(tmp_path, data=own).shared)
     assert "warning" not in capsys.readouterr().out
-    job(tmp_path, data=own, env={"rendering": "near"}).shared.data()
+    collect_data(job(tmp_path, data=own, env={"rendering": "near"}).shared)
     assert "data of rendering=fast, but the task has rendering=near" in capsys.readouterr().out
 
 
@@ -230,7 +234,7 @@ def test_half_a_pretraining_is_continued(tmp_path, monkeypatch):
     shared = job(tmp_path).shared
     (shared.model_path / "done.json").unlink()  # as if killed after the last checkpoint
     monkeypatch.setattr(WPT, "_update_world_model", lambda *_: pytest.fail("from the start"))
-    shared.model(shared.data())
+    pretrain(shared, collect_data(shared))
     assert (shared.model_path / "done.json").exists()
 
 
@@ -239,7 +243,7 @@ def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
         raise RuntimeError("out of luck")
 
     with monkeypatch.context() as broken:
-        broken.setattr(runner, "_learn", die)
+        broken.setattr(runner, "learn", die)
         assert not runner.run_all([job(tmp_path), job(tmp_path, "scratch")])
     assert "out of luck" in (job(tmp_path).folder / "error.txt").read_text()
     assert not (job(tmp_path).folder / "result.json").exists()
@@ -324,17 +328,17 @@ def test_one_value_has_no_interval():
     assert mean_interval([3.0]) == (3.0, None, None)
 
 
-def fake_result(seed, mean, method="wpt", task="dmc-walker-run"):
-    about = {"task": task, "method": method, "preset": "paper", "seed": seed, "frames": 150_000}
-    returns = [mean - 10, mean + 10]
-    score = {"mean": mean, "success_rate": None, "returns": returns, "low": None, "high": None}
-    return about | {"metric": "return", "commit": "abc", "scores": {"WPT": score}}
+def fake_result(seed, mean, method="wpt", frames=150_000, untrained=()):
+    score = Score((mean - 10, mean + 10))
+    scores = {**dict.fromkeys(untrained, Score((-9.0, 11.0))), "last": score}
+    where = "dmc", "dmc-walker-run", method, Variant("paper"), seed, frames, frames // 2
+    return Result(*where, "return", scores, {}, "abc")
 
 
 def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
     for seed, mean in enumerate((700.0, 710.0, 720.0)):
         (tmp_path / str(seed)).mkdir()
-        (tmp_path / str(seed) / "result.json").write_text(json.dumps(fake_result(seed, mean)))
+        write_result(tmp_path / str(seed), fake_result(seed, mean))
     (row,) = tables.summarise(read_results(tmp_path))
     # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
     assert (row.seeds, row.mean, row.paper) == (3, 710, 728.0)
@@ -342,7 +346,7 @@ def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
 
 
 def test_the_report_keeps_methods_and_budgets_apart():
-    other = fake_result(0, 1.0) | {"frames": 1}
+    other = fake_result(0, 1.0, frames=1)
     rows = tables.summarise([fake_result(0, 1.0), fake_result(0, 2.0, "scratch"), other])
     assert [(row.method, row.frames) for row in rows] == [
         ("scratch", 150_000),
@@ -364,7 +368,7 @@ def test_the_report_prints_as_table_and_as_markdown(capsys):
 def test_every_policy_has_its_seeds_and_three_intervals():
     results = [fake_result(seed, mean) for seed, mean in enumerate((700.0, 710.0, 720.0))]
     (row,) = tables.policies(results)
-    assert (row.policy, row.seeds, row.means, row.mean) == ("WPT", (0, 1, 2), (700, 710, 720), 710)
+    assert (row.name, row.seeds, row.means, row.mean) == ("wpt", (0, 1, 2), (700, 710, 720), 710)
     # six episodes, each 10 from its seed's mean: sd of the mean 10 / sqrt(6) = 4.1, extremes 700
     assert 700 <= row.episodes_low < 705 and 715 < row.episodes_high <= 720
     # all three draws the same seed: probability 1/27 > 2.5 %
@@ -374,19 +378,18 @@ def test_every_policy_has_its_seeds_and_three_intervals():
 
 
 def test_untrained_policies_are_told_once_however_many_methods_met_them():
-    results = [fake_result(0, 5.0, method) for method in ("wpt", "scratch")]
-    for result in results:
-        result["scores"] = {"nothing": fake_result(0, 1.0)["scores"]["WPT"]} | result["scores"]
+    methods = ("wpt", "scratch")
+    results = [fake_result(0, 5.0, method, untrained=["nothing"]) for method in methods]
     rows = tables.policies(results)
     assert [(row.method, row.policy) for row in rows] == [
         ("", "nothing"),
-        ("scratch", "WPT"),
-        ("wpt", "WPT"),
+        ("scratch", "last"),
+        ("wpt", "last"),
     ]
     assert rows[0].seeds_low is None  # one seed
     told = tables.policy_markdown(rows)
     assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in told
-    assert "| WPT, scratch | 5.0 |" in told
+    assert "| scratch | 5.0 |" in told
     assert "Seeds 0, 2 episodes each; commit abc." in told
 
 
@@ -496,7 +499,7 @@ def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
     assert "dmc-dot" in capsys.readouterr().out
     assert call(monkeypatch, "report", tmp_path, "--markdown") == 0
     told = capsys.readouterr().out
-    assert all(f"| {name} |" in told for name in ("doing nothing", "prior actor", "WPT"))
+    assert all(f"| {name} |" in told for name in ("doing nothing", "prior actor", "wpt"))
     assert call(monkeypatch, "report", tmp_path, "--csv") == 0
     assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")
 
@@ -511,14 +514,14 @@ def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp
 def test_runs_of_a_changed_preset_are_told_apart(tmp_path):
     given = "dmc", ["walker-stand"], "debug", "1", ["wpt"]
     plain, changed, longer = (
-        make_plan(*given, settings, tmp_path, 1, "cpu")[0].label
+        str(make_plan(*given, settings, tmp_path, 1, "cpu")[0].variant)
         for settings in ([], ["gamma=0.9", "env.rendering=near"], ["learn.frames=9000"])
     )
     assert (plain, changed, longer) == ("debug", "debug env.rendering=near gamma=0.9", "debug")
 
 
 def test_data_that_have_grown_are_pretrained_on_anew(tmp_path):
-    own = job(tmp_path).shared.data().path.rename(tmp_path / "own")
+    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
     before = job(tmp_path, data=own).shared.model_path
     assert job(tmp_path, data=own).shared.model_path == before
     with TrajectoryDataset.open(own) as dataset:

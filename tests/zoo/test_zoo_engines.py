@@ -14,6 +14,7 @@ from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
 from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
+from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run import engines
 from wpt_agents.zoo.run.engines import Local, Ray, Resources, Slurm, run_on
 from wpt_agents.zoo.run.locks import locked
@@ -78,7 +79,7 @@ def test_a_real_run_on_an_engine_leaves_the_same_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "do", do_dot)
     one = job(tmp_path, "scratch")
     assert run_on("local", [one], False, Resources(workers=1))
-    assert one.result()["seed"] == 0
+    assert read_result(one.folder).seed == 0
     assert "evaluate" in (one.folder / "log.txt").read_text()
     assert (one.folder / "command.txt").read_text().strip() == one.command
     assert standing(one).state == "finished"

@@ -10,11 +10,11 @@ import pytest
 from run_folders import make_run
 
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.report import aggregates, figures, sections
+from wpt_agents.zoo.report import aggregates, figures, headline
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.report.page import write_page
-from wpt_agents.zoo.report.sections import shared_about
+from wpt_agents.zoo.report.paper_tables import Cell, TableRow, shared_note, without_notes
 
 
 @pytest.fixture
@@ -100,12 +100,13 @@ def test_budgets_seeds_and_commits_stand_in_the_cells_where_they_differ(tmp_path
 
 
 def test_budgets_seeds_and_commits_stand_at_the_columns_head_where_they_agree():
-    def row(*abouts):
-        return {"ours": [{"run": "a", "about": about} for about in abouts]}
+    def row(*notes):
+        return TableRow("task", False, [], [Cell(0.0, "a", note=note) for note in notes])
 
-    alike = [row("1k frames", "1k frames"), row("1k frames", "2k frames")]
-    assert [shared_about(alike, place) for place in range(2)] == ["1k frames", ""]
-    assert [[cell["about"] for cell in r["ours"]] for r in alike] == [
+    rows = [row("1k frames", "1k frames"), row("1k frames", "2k frames")]
+    notes = [shared_note(rows, place) for place in range(2)]
+    assert notes == ["1k frames", ""]
+    assert [[cell.note for cell in without_notes(r, notes).ours] for r in rows] == [
         ["", "1k frames"],
         ["", "2k frames"],
     ]
@@ -129,7 +130,7 @@ def test_one_seed_has_no_interval_and_the_page_says_so(tmp_path):
     assert "1 of 22 1 0.73 no interval 0.73 no interval" in told
     assert "scratch 1.00 no interval 1" in told  # probability of improvement
     assert "730 one seed: no interval" in told
-    assert "One seed a task: no interval over seeds" in told
+    assert "One seed per task: no interval over seeds" in told
     assert "No run of the method" not in told
 
 
@@ -199,8 +200,8 @@ def test_figures_are_whole_svg_in_the_pages_colours():
 def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
     tasks = ["dmc-walker-run", "dmc-walker-stand"]  # 728.0 and 969.4 in Table 5
     given = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
-    assert given["mean"] == pytest.approx((0.728 + 0.9694) / 2)
-    assert aggregates.paper_aggregate("dmc", tasks, "no-rehearsal", 150_000) == {}
+    assert given.mean == pytest.approx((0.728 + 0.9694) / 2)
+    assert aggregates.paper_aggregate("dmc", tasks, "no-rehearsal", 150_000) is None
 
 
 def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
@@ -214,17 +215,17 @@ def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
 
 def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart():
     high, low, wide, single = [9, 10, 11], [1, 2, 3], [0, 2, 10], [1]
-    assert sections.above(high, low) and not sections.above(low, high)
-    assert not sections.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
-    assert not sections.above(high, single) and not sections.above(single, low)
+    assert headline.above(high, low) and not headline.above(low, high)
+    assert not headline.above(high, wide)  # t's interval of 0, 2, 10 reaches to 17
+    assert not headline.above(high, single) and not headline.above(single, low)
 
 
 def test_the_headline_compares_successes_where_they_are_the_score(tmp_path):
     for seed in range(3):  # 4.9 and less is no success
         make_run(tmp_path, "metaworld-reach", seed, "wpt", (4.9 - seed / 100, 4.9))
         make_run(tmp_path, "metaworld-reach", seed, "scratch", (0.0, 5.1 + seed / 100))
-    [told] = sections.headline(read_results(tmp_path))
-    against = {each["name"]: (each["above"], each["below"]) for each in told["against"]}
+    [told] = headline.headlines(read_results(tmp_path))
+    against = {each.policy: (each.above, each.below) for each in told.against}
     assert against == {"random policy": (0, 0), "prior actor": (0, 0), "same, from scratch": (0, 1)}
 
 
@@ -232,5 +233,5 @@ def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
     make_run(tmp_path / "a", "metaworld-reach", returns=(9.0, 1.0))
     make_run(tmp_path / "b", "dmc-walker-run", returns=(100.0, 100.0), frames=1000)
     make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
-    [told] = sections.both_suites(read_results(tmp_path))
-    assert told["ours"] == pytest.approx((0.5 + 0.1) / 2)
+    [told] = headline.both_suites(read_results(tmp_path))
+    assert told.ours == pytest.approx((0.5 + 0.1) / 2)

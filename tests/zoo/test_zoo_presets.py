@@ -264,4 +264,4 @@ def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_pat
     methods, settings = ["scratch", "scratch"], ["gamma=0.98", "gamma=0.9"]
     given = "dmc", ["walker-run"], "debug", "1", methods, settings
     [one] = make_plan(*given, tmp_path, 1, "cpu")
-    assert (one.wpt["gamma"], one.label) == (0.9, "debug gamma=0.9")
+    assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")

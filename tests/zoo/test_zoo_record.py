@@ -8,8 +8,11 @@ from typer.testing import CliRunner
 
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.report import record
+from wpt_agents.zoo.report import record, record_tables
 from wpt_agents.zoo.report.folders import find_finished
+from wpt_agents.zoo.report.names import policy_name
+from wpt_agents.zoo.report.record_tables import Key
+from wpt_agents.zoo.result import Result, Score, Variant
 
 
 def lines_of(folder):
@@ -17,7 +20,9 @@ def lines_of(folder):
 
 
 def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc", preset="tiny"):
-    return record.Line(suite, task, method, seed, preset, frames, score, 0, None, 0, "c", "x")
+    return record.Line(
+        *(suite, task, method, seed, Variant.parse(preset), frames, score, 0, None, 0, "c", "x")
+    )
 
 
 def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
@@ -38,34 +43,40 @@ def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
     }
 
 
+def result(method="wpt", preset="tiny", scores=()):
+    where = "dmc", "t", method, Variant.parse(preset), 0, 10, 5
+    return Result(*where, "return", {policy: Score((1.0,)) for policy in scores})
+
+
 def test_data_of_ones_own_are_in_the_command():
-    result = {"suite": "dmc", "task": "t", "method": "wpt", "seed": 0, "frames": 10}
     changes = "data=my/own 'collect.tasks=[a, b]' 'guidance=linear(1,0,9)'"
-    told = record.command(result | {"preset": f"tiny {changes}"})
+    told = result(preset=f"tiny {changes}").command
     assert told.endswith(
-        "--data my/own --set 'collect.tasks=[a, b]' --set 'guidance=linear(1,0,9)'"
+        "--set 'collect.tasks=[a, b]' --set 'guidance=linear(1,0,9)' --data my/own"
     )
 
 
 def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
-    names = [("WPT", "scratch"), ("WPT, last", "wpt"), ("prior actor", "no-pretrain")]
-    names += [("prior actor", "kickstart"), ("WPT", "kickstart")]
-    told = [record._method(*each) for each in names]
-    assert told[:3] == ["scratch", "wpt, last", "prior actor, no-pretrain"]
-    assert told[3:] == ["prior actor", "kickstart"]  # the same clone as wpt's
+    kept = result("wpt", scores=["last", "best"])
+    assert policy_name(kept, "last") == "wpt, last" and policy_name(kept, "best") == "wpt"
+    assert policy_name(kept, "after head start") == "wpt, after head start"
+    names = [("last", "scratch"), ("prior actor", "no-pretrain"), ("random", "scratch")]
+    told = [policy_name(result(method, scores=["last"]), policy) for policy, method in names]
+    assert told == ["scratch", "prior actor, no-pretrain", "random"]
+    assert policy_name(result("kickstart"), "prior actor") == "prior actor"  # the clone of wpt
 
 
 def test_untrained_policies_are_told_apart_by_how_they_are_played(tmp_path):
     for preset in ("demo", "debug", "demo size=tiny", "demo evaluate.episodes=3"):
         make_run(tmp_path, "dmc-walker-run", method="scratch", preset=preset)
-    lines = [each.preset for each in lines_of(tmp_path) if each.method == "random"]
+    lines = [str(each.preset) for each in lines_of(tmp_path) if each.method == "random"]
     assert lines == ["debug", "demo", "demo evaluate.episodes=3"]
 
 
 def test_budgets_are_kept_apart_where_there_is_no_run_of_wpt():
     lines = [line("scratch", 10.0, frames=100), line("scratch", 90.0, frames=300)]
     lines += [line("scratch", 50.0, frames=900, preset="small"), line("random", 1.0, frames=0)]
-    means = record.by_suite(lines)
+    means = record_tables.by_suite(lines)
     found = {method: cell.mean for method, suites in means.items() for _, cell in suites.values()}
     assert found == {
         **{"random": 1.0, "scratch": 10.0, "scratch, 3x frames": 90.0},
@@ -90,15 +101,16 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
         *[("scratch", 3.0), ("wpt", 1.5), ("wpt", 9.0)]
     ]
     assert path.read_text().splitlines()[0] == (
-        "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command"
+        "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command,"
+        "updates,cpu_seconds,model"
     )
 
 
 def test_presets_are_kept_apart():
     lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
     assert len({each.run for each in lines}) == 3
-    assert set(record.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
-    assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record.markdown(lines)
+    assert set(record_tables.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
+    assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record_tables.markdown(lines)
 
 
 def test_another_csv_is_refused(tmp_path):
@@ -113,12 +125,14 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
         *[line("wpt", score, "mw-a", seed, 50, "mw") for seed, score in enumerate((80.0, 100.0))],
         *[line("scratch", 30.0, "mw-a", 0, 150, "mw"), line("random", 7.0, "mw-a", 0, 0, "mw")],
     ]
-    found = record.by_suite(lines)
+    found = record_tables.by_suite(lines)
     assert found["wpt"]["dmc"][0] == 3 and found["wpt"]["mw"][1].mean == 90
     both = found["wpt"]["both"][1]
     assert (both.mean, both.low, both.high) == (45, 40, 50)
     assert found["scratch, 3x frames"]["mw"][1].low is None  # of one seed
-    fewer = record.by_suite([each for each in lines if (each.task, each.seed) != ("dmc-0", 1)])
+    fewer = record_tables.by_suite(
+        [each for each in lines if (each.task, each.seed) != ("dmc-0", 1)]
+    )
     assert fewer["wpt"]["mw"][1].low == 80 and fewer["wpt"]["both"][1].low is None  # one of them
     assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
 
@@ -147,12 +161,12 @@ def test_a_record_is_kept_whatever_is_printed(tmp_path, form):
 
 def test_three_suites_have_no_mean_of_both():
     lines = [line("wpt", 1.0, task=suite, suite=suite) for suite in ("dmc", "mw", "robotics")]
-    assert set(record.by_suite(lines)["wpt"]) == {"dmc", "mw", "robotics"}
+    assert set(record_tables.by_suite(lines)["wpt"]) == {"dmc", "mw", "robotics"}
 
 
 def test_the_pages_rows_are_the_records():
     root = Path(__file__).parents[2]
-    told = record.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
+    told = record_tables.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
     assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()
     page = (root / "docs" / "small-benchmark.md").read_text().splitlines()
     rows = [line for line in page if line.startswith(("| dmc", "| metaworld", "| both |"))]
@@ -163,19 +177,40 @@ def test_methods_are_told_from_doing_nothing_to_ours():
     assert set(METHODS) < set(record.ORDER)
     told = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
     lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(told)]
-    shown = sorted(lines, key=record._order)
+    shown = sorted(lines, key=record.order)
     assert [(x.task, x.method) for x in shown] == [(task, m) for task in "ab" for m in told]
-    assert list(record.by_suite(lines)) == ["nothing", "scratch", "wpt, last", "wpt", *told[4:]]
+    assert list(record_tables.by_suite(lines)) == [
+        "nothing",
+        "scratch",
+        "wpt, last",
+        "wpt",
+        *told[4:],
+    ]
 
 
 def test_a_method_of_two_presets_is_drawn_with_what_was_changed():
-    keys = [("scratch", "tiny", 10), ("wpt", "tiny", 10), ("wpt", "tiny train_ratio=64", 10)]
-    assert record._names(keys) == ["scratch", "wpt", "wpt,\ntrain_ratio=64"]
-    assert record._names([*keys, ("wpt", "tiny", 30)])[1] == "wpt, 10 frames"
-    others = [("wpt", "tiny", 10), ("wpt", "small", 10)]
-    assert record._names(others) == ["wpt,\ntiny", "wpt,\nsmall"]
+    keys = [
+        Key("scratch", Variant.parse("tiny"), 10),
+        Key("wpt", Variant.parse("tiny"), 10),
+        Key("wpt", Variant.parse("tiny train_ratio=64"), 10),
+    ]
+    assert record_tables.row_names(keys) == ["scratch", "wpt", "wpt,\ntrain_ratio=64"]
+    assert (
+        record_tables.row_names([*keys, Key("wpt", Variant.parse("tiny"), 30)])[1]
+        == "wpt, 10 frames"
+    )
+    others = [Key("wpt", Variant.parse("tiny"), 10), Key("wpt", Variant.parse("small"), 10)]
+    assert record_tables.row_names(others) == ["wpt,\ntiny", "wpt,\nsmall"]
 
 
 def test_a_method_of_two_budgets_is_drawn_with_both():
-    keys = [("nothing", "", 0), ("scratch", "tiny", 100), ("scratch", "tiny", 3000)]
-    assert record._names(keys) == ["nothing", "scratch, 100 frames", "scratch, 3,000 frames"]
+    keys = [
+        Key("nothing", Variant(""), 0),
+        Key("scratch", Variant.parse("tiny"), 100),
+        Key("scratch", Variant.parse("tiny"), 3000),
+    ]
+    assert record_tables.row_names(keys) == [
+        "nothing",
+        "scratch, 100 frames",
+        "scratch, 3,000 frames",
+    ]

@@ -21,6 +21,7 @@ from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import promises
 from wpt_agents.zoo.judge.trained import find_trained
 from wpt_agents.zoo.report.hub import card, pull, push
+from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run.runner import run
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -39,9 +40,9 @@ def moved(tmp_path):
 def test_a_moved_run_without_its_data_plays_as_it_did(moved):
     folder, result, seed = moved
     trained = find_trained(folder)
-    for policy, name in (("wpt", "WPT"), ("prior", "prior actor")):
+    for policy, name in (("wpt", "last"), ("prior", "prior actor")):
         score = trained.evaluate(trained.load(policy), 3, seed)
-        assert score.returns == pytest.approx(result["scores"][name]["returns"])
+        assert score.returns == pytest.approx(result.scores[name].returns)
 
 
 def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
@@ -138,12 +139,14 @@ def test_the_hub_is_asked_for_only_when_needed_and_told_if_missing(tmp_path, mon
 
 
 def test_the_card_tells_scores_command_and_how_to_load(tmp_path):
-    told = card(make_run(tmp_path, "dmc-walker-run", 3, returns=(700.0, 720.0)), "me/walker")
+    told = card(
+        read_result(make_run(tmp_path, "dmc-walker-run", 3, returns=(700.0, 720.0))), "me/walker"
+    )
     about = yaml.safe_load(told.split("---\n")[1])
     (result,) = about["model-index"][0]["results"]
     assert result["metrics"][0]["value"] == 710.0
     assert about["library_name"] == "wpt-agents"
-    for text in ("| WPT | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
+    for text in ("| wpt | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
         assert text in told
 
 

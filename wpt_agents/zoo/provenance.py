@@ -22,7 +22,7 @@ def commit() -> str | None:
 
     Asked once, when the first run begins: the code that is at work does not change after that.
     """
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[2]
     if shutil.which("git") is None or not (root / ".git").exists():
         return None
     answer = subprocess.run(

@@ -1,33 +1,268 @@
-"""What a run found, typed; this module alone reads and writes `result.json`."""
+"""What a run found, typed; this module alone reads and writes `result.json`.
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+Example::
+
+    result = read_result(Path("runs/demo/wpt/metaworld-drawer-close_0"))
+    result.final.mean, result.scores["prior actor"].success_rate, result.command
+"""
+
+import json
+import shlex
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import total_ordering
+from pathlib import Path
+from typing import Any, Literal, Self
 
 import numpy as np
 
+from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.statistics import mean_interval
+
+FILE = "result.json"
+
+# The policies that a run may score, in the order in which tables show them.
+NOTHING = "nothing"  # the zero action
+RANDOM = "random"  # uniform actions
+PRIOR_ACTOR = "prior actor"  # the clone of the retrieved trajectories
+HEAD_START = "after head start"  # the actor when the head start of fine-tuning ended
+LAST = "last"  # the agent at the end of fine-tuning
+BEST = "best"  # the agent that did best in the evaluations during fine-tuning
+POLICIES = (NOTHING, RANDOM, PRIOR_ACTOR, HEAD_START, LAST, BEST)
+UNTRAINED = (NOTHING, RANDOM)
+
+Metric = Literal["return", "success"]
+
+
+def final_policy(policies: Collection[str]) -> str:
+    """Return the policy that a run counts for: the best one if it kept it, else the last."""
+    return BEST if BEST in policies else LAST
+
+
+@dataclass(frozen=True, order=True)
+class Change:
+    """One setting that differs from its preset, as `--set key=value` wrote it."""
+
+    key: str
+    value: str
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read "key=value"."""
+        key, _, value = text.partition("=")
+        return cls(key.strip(), value)
+
+    def __str__(self) -> str:
+        return f"{self.key}={self.value}"
+
+
+@total_ordering
+@dataclass(frozen=True)
+class Variant:
+    """A preset, the settings that differ from it, and the user's own data if there are any.
+
+    `str(variant)` is the name that tables and records show: "tiny size=debug data=mine".
+
+    :param changes: sorted by key; the budget (`learn.frames`) is not among them
+    :param data: the dataset's path as the user typed it, None for the preset's own data
+    """
+
+    preset: str
+    changes: tuple[Change, ...] = ()
+    data: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `str(variant)` back: from CSV cells and from the result files of version 0.1."""
+        preset, *words = shlex.split(text)
+        changes = tuple(Change.parse(word) for word in words if not word.startswith("data="))
+        data = [word.removeprefix("data=") for word in words if word.startswith("data=")]
+        return cls(preset, changes, data[0] if data else None)
+
+    @property
+    def words(self) -> list[str]:
+        """The words of `str(variant)`, before quoting."""
+        data = [] if self.data is None else [f"data={self.data}"]
+        return [self.preset, *map(str, self.changes), *data]
+
+    def __str__(self) -> str:
+        return shlex.join(self.words)
+
+    def __lt__(self, other: Self) -> bool:
+        return str(self) < str(other)
+
+    @property
+    def playing(self) -> Self:
+        """The part that changes how untrained policies are played: env and evaluation settings."""
+        changes = tuple(c for c in self.changes if c.key.startswith(("env.", "evaluate.")))
+        return type(self)(self.preset, changes)
 
 
 @dataclass(frozen=True)
 class Score:
-    """The returns of one policy, and successes where the task reports them."""
+    """The returns of one policy over seeded episodes.
 
-    returns: list[float]
-    successes: list[bool]
+    :param successes: whether each episode ended in success; empty if the task reports none
+    """
+
+    returns: tuple[float, ...]
+    successes: tuple[bool, ...] = ()
+
+    @property
+    def mean(self) -> float:
+        """The mean return."""
+        return self.interval[0]
 
     @property
     def interval(self) -> tuple[float, float | None, float | None]:
-        """Mean return, and its 95 % interval."""
+        """The mean return and its 95 % interval over episodes by Student's t."""
         return mean_interval(self.returns)
 
-    def as_dict(self) -> dict[str, Any]:
-        """What `result.json` holds."""
-        mean, low, high = self.interval
-        rate = float(np.mean(self.successes)) if self.successes else None
-        return asdict(self) | {"mean": mean, "low": low, "high": high, "success_rate": rate}
+    @property
+    def success_rate(self) -> float | None:
+        """The share of successful episodes, None if the task reports none."""
+        return float(np.mean(self.successes)) if self.successes else None
 
-    @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
-        """Reads back `as_dict`."""
-        return cls(given["returns"], given["successes"])
+    def counted(self, metric: Metric) -> float:
+        """The number that the score counts as: its success rate, or its mean return."""
+        if metric == "return":
+            return self.mean
+        assert self.success_rate is not None, "a task of metric 'success' reports successes"
+        return self.success_rate
+
+
+@dataclass(frozen=True)
+class Result:
+    """Everything that a finished run found.
+
+    :param steps: calls of `env.step` in fine-tuning; `frames` counts simulator frames
+    :param scores: by policy, see `POLICIES`
+    :param seconds: wall-clock seconds of each stage
+    :param commit: of the code, None outside a checkout
+    :param updates: gradient updates of fine-tuning, None if the agent does not count them
+    :param cpu_seconds: processor seconds of the learning process, None in results of version 0.1
+    :param model: the first digits of the SHA-256 of the model file that counts
+    """
+
+    suite: str
+    task: str
+    method: str
+    variant: Variant
+    seed: int
+    frames: int
+    steps: int
+    metric: Metric
+    scores: Mapping[str, Score]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    commit: str | None = None
+    updates: int | None = None
+    cpu_seconds: float | None = None
+    model: str | None = None
+
+    @property
+    def final_policy(self) -> str:
+        """The policy that the run counts for."""
+        return final_policy(self.scores)
+
+    @property
+    def final(self) -> Score:
+        """The score that the run counts for."""
+        return self.scores[self.final_policy]
+
+    def counted(self, policy: str | None = None) -> float:
+        """Return a policy's success rate, or its mean return where the task counts returns.
+
+        :param policy: the final one if None
+        """
+        return self.scores[policy or self.final_policy].counted(self.metric)
+
+    @property
+    def identity(self) -> tuple[str, str, Variant, int, int]:
+        """What tells this run from every other: task, method, variant, budget and seed."""
+        return self.task, self.method, self.variant, self.frames, self.seed
+
+    @property
+    def commit_name(self) -> str:
+        """The commit for a table."""
+        return self.commit or "unknown"
+
+    @property
+    def command(self) -> str:
+        """A command that repeats the run, whatever folder it is typed in."""
+        words = ["python", "-m", "wpt_agents.zoo", "run", "--suite", self.suite]
+        words += ["--tasks", self.task, "--method", self.method, "--preset", self.variant.preset]
+        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
+        for change in self.variant.changes:
+            words += ["--set", str(change)]
+        if self.variant.data is not None:
+            words += ["--data", self.variant.data]
+        return shlex.join(words)
+
+
+def read_result(folder: Path) -> Result | None:
+    """Read the result of the run in `folder`, None while it is not finished.
+
+    :raises ValueError: the file is damaged
+    """
+    path = folder / FILE
+    if not path.exists():
+        return None
+    try:
+        return _from_json(json.loads(path.read_text()))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
+
+
+def write_result(folder: Path, result: Result) -> None:
+    """Write the result of the run in `folder`, as a whole or not at all."""
+    with replacing(folder / FILE) as temporary:
+        temporary.write_text(json.dumps(_to_json(result), indent=1))
+
+
+def read_score(path: Path) -> Score | None:
+    """Read the score in a file of its own, None if there is no such file."""
+    return _score(json.loads(path.read_text())) if path.exists() else None
+
+
+def write_score(path: Path, score: Score) -> None:
+    """Write one score to a file of its own, as a whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(_score_json(score), indent=1))
+
+
+def _to_json(result: Result) -> dict[str, Any]:
+    fields = asdict(result)
+    variant = fields.pop("variant")
+    scores = {name: _score_json(score) for name, score in result.scores.items()}
+    return {**fields, **variant, "scores": scores, "command": result.command}
+
+
+def _score_json(score: Score) -> dict[str, Any]:
+    """Write what can be computed, too: other programs read these files."""
+    mean, low, high = score.interval
+    computed = {"mean": mean, "low": low, "high": high, "success_rate": score.success_rate}
+    return {"returns": list(score.returns), "successes": list(score.successes), **computed}
+
+
+def _score(stored: Mapping[str, Any]) -> Score:
+    return Score(tuple(stored["returns"]), tuple(stored["successes"]))
+
+
+def _from_json(stored: dict[str, Any]) -> Result:
+    """Build a result from a file of this version or of version 0.1.
+
+    In version 0.1 "preset" held the whole name of the variant, and the policies "last" and "best"
+    were called "WPT", or "WPT, last" and "WPT".
+    """
+    if "changes" in stored:
+        changes = tuple(Change(**change) for change in stored.pop("changes"))
+        variant = Variant(stored.pop("preset"), changes, stored.pop("data"))
+    else:
+        variant = Variant.parse(stored.pop("preset"))
+    scores = {name: _score(score) for name, score in stored.pop("scores").items()}
+    names = {"WPT": LAST}
+    if "WPT, last" in scores:
+        names = {"WPT, last": LAST, "WPT": BEST}
+    scores = {names.get(name, name): score for name, score in scores.items()}
+    stored.pop("command", None)
+    return Result(variant=variant, scores=scores, **stored)

@@ -32,7 +32,7 @@ def report(
     are gone; results.md and results.png beside it show it.
     """
     from wpt_agents.zoo.report import record as records
-    from wpt_agents.zoo.report import tables
+    from wpt_agents.zoo.report import record_tables, tables
     from wpt_agents.zoo.report.folders import find_finished, read_results
     from wpt_agents.zoo.report.page import write_page
     from wpt_agents.zoo.terminal import console
@@ -42,12 +42,13 @@ def report(
     results = read_results(folder)
     if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
-    rows, policies = tables.summarise(results), tables.policies(results)
+    rows = tables.summarise(results)
+    policies = tables.policies(results)
     as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
     if record is not None:
         lines = records.update(record, records.lines_of(find_finished(folder)))
-        record.with_suffix(".md").write_text(records.markdown(lines))
-        records.draw(record.with_suffix(".png"), lines)
+        record.with_suffix(".md").write_text(record_tables.markdown(lines))
+        record_tables.draw(record.with_suffix(".png"), lines)
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:

@@ -68,7 +68,8 @@ def pretrain_model(
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device
     from wpt_agents.zoo.plan.presets import load_preset
-    from wpt_agents.zoo.run.shared import Shared
+    from wpt_agents.zoo.plan.shared import Shared
+    from wpt_agents.zoo.run.shared import collect_data, pretrain
     from wpt_agents.zoo.terminal import console
 
     check_device(device)
@@ -77,8 +78,8 @@ def pretrain_model(
     with joined(local_device(device)) as world:
         console.quiet = world.rank > 0
         with world.rank_0_first():
-            dataset = shared.data()
-        model = shared.model(dataset).resolve()
+            dataset = collect_data(shared)
+        model = pretrain(shared, dataset).resolve()
         if world.rank == 0:
             typer.echo(f"Model: {model}")
 

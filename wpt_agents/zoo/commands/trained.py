@@ -43,7 +43,7 @@ def evaluate_model(
     typer.echo(f"95 % interval    {interval_text(low, high)}")
     typer.echo(f"returns          {', '.join(map(number, score.returns))}")
     if score.successes:
-        typer.echo(f"success          {score.as_dict()['success_rate']:.2f}, at the last step")
+        typer.echo(f"success          {score.success_rate:.2f}, at the last step")
 
 
 def enjoy_model(

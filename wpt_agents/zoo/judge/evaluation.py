@@ -1,6 +1,6 @@
-"""How good a policy is: returns over seeded episodes, their mean and its 95 % interval."""
+"""How good a policy is: its returns over seeded episodes, and a film of one of them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import wpt_envs
+from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -15,39 +16,41 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act
-from wpt_agents.zoo.collect.episodes import record
 from wpt_agents.zoo.judge.untrained import State
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.terminal import progress
 
-EPISODE = 2  # a purpose in a seed's derivation, beside `plan.EVALUATION`
+Wrap = Callable[[VecEnv], VecEnv]
+
+EPISODE = 2  # a purpose in a seed's derivation, beside `plan.runs.EVALUATION`
 
 
 class EpisodeSeeds(gym.Wrapper):
-    """Seeds each reset by the number of the episode, so that an episode depends on none before it.
+    """Seeds each reset by the number of the episode, so that no episode depends on earlier ones.
 
-    A seed given to `reset` is that of episode 0, and those of all others are derived from it.
+    A seed passed to `reset` is that of episode 0; the seeds of all others are derived from it.
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self.seed, self.episode = 0, 0
+        self.seed = 0
+        self.episode = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins the next episode."""
+        """Begin the next episode."""
         self.seed = self.seed if seed is None else seed
         return self.env.reset(seed=self.next_seed(), options=options)
 
     def next_seed(self) -> int:
-        """The seed of the next episode, which counts as begun."""
+        """Return the seed of the next episode, and count that episode as begun."""
         drawn = np.random.SeedSequence([self.seed, EPISODE, self.episode]).generate_state(1)
         self.episode += 1
         return int(drawn[0] >> 1) if self.episode > 1 else self.seed
 
     def go_to_episode(self, number: int) -> None:
-        """The next reset begins episode `number`."""
+        """Let the next reset begin episode `number`."""
         self.episode = number
 
 
@@ -59,20 +62,20 @@ def make_vec_env(
     monitor: str | None = None,
     workers: bool = False,
 ) -> VecEnv:
-    """Seeded copies of a task, each under SB3's Monitor.
+    """Make seeded copies of a task, each under SB3's Monitor.
 
-    :param monitor: the file of its episodes, which is continued if it is there
-    :param workers: give each a process of its own
+    :param monitor: the file of its episodes, which is continued if it exists
+    :param workers: whether to give each copy a process of its own
     """
-    anew = monitor is None or not Path(monitor).exists()
+    new = monitor is None or not Path(monitor).exists()
     row = wpt_envs.TASKS.get(task)
-    told = ("is_success",) if row is not None and row.metric == "success" else ()
+    logged = ("is_success",) if row is not None and row.metric == "success" else ()
 
     def make() -> gym.Env:
         import wpt_envs  # noqa: F401  # a worker process knows the ids from it
 
         made = EpisodeSeeds(gym.make(task, **env))
-        return Monitor(made, monitor, info_keywords=told, override_existing=anew)
+        return Monitor(made, monitor, info_keywords=logged, override_existing=new)
 
     venv = SubprocVecEnv([make] * n_envs) if workers else DummyVecEnv([make] * n_envs)
     venv.seed(seed)
@@ -80,7 +83,7 @@ def make_vec_env(
 
 
 def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
-    """How many calls of `env.step` an episode of the task lasts, when known."""
+    """Return how many calls of `env.step` an episode of the task lasts, None if unknown."""
     row = wpt_envs.TASKS.get(task)
     return row.frames // env.get("action_repeat", 2) if row else None
 
@@ -92,32 +95,36 @@ def evaluate(
     episodes: int,
     seed: int,
     label: str = "",
+    wrap: Wrap | None = None,
 ) -> Score:
-    """Returns over `episodes` episodes, each with its own seed, all played side by side.
+    """Play `episodes` episodes side by side, each with its own seed.
 
-    Policies evaluated with one `seed` meet the same initial states.
+    Policies that are evaluated with the same `seed` start from the same initial states.
+
+    :param wrap: what the policy needs around its environments
     """
     successes: list[bool] = []
     venv = make_vec_env(task, env, seed, episodes)
     steps = episode_steps(task, env)
     with (
-        closing(venv),
+        closing(wrap(venv) if wrap else venv) as wrapped,
         progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar,
     ):
 
         def watch(local: dict[str, Any], _: dict[str, Any]) -> None:
             bar.update(1)
-            if local["done"] and "is_success" in local["info"]:
-                successes.append(bool(local["info"]["is_success"]))
+            info = local["info"]
+            if local["done"] and "is_success" in info:
+                successes.append(bool(info["is_success"]))
 
         returns, _ = evaluate_policy(
-            policy, venv, episodes, callback=watch, return_episode_rewards=True
+            policy, wrapped, episodes, callback=watch, return_episode_rewards=True
         )
-    return Score(np.asarray(returns, float).tolist(), successes)
+    return Score(tuple(np.asarray(returns, float).tolist()), tuple(successes))
 
 
 def acting(policy: PolicyPredictor) -> Act:
-    """A policy as `record` plays it: remembers the recurrent state within an episode."""
+    """Return the policy as `record` plays it: it keeps the recurrent state within an episode."""
     state: State | None = None
 
     def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
@@ -130,16 +137,40 @@ def acting(policy: PolicyPredictor) -> Act:
 
 
 def film(
-    policy: PolicyPredictor, task: str, env: Mapping[str, Any], seed: int, size: int = 256
+    policy: PolicyPredictor,
+    task: str,
+    env: Mapping[str, Any],
+    seed: int,
+    size: int = 256,
+    wrap: Wrap | None = None,
 ) -> tuple[Trajectory, list[np.ndarray], float]:
-    """One episode, its pictures at `size`, and the frames a second that make it real time."""
-    frames: list[np.ndarray] = []
+    """Play one episode and render it.
+
+    :param wrap: what the policy needs around its environment
+    :return: the episode, its frames at `size`, and the frame rate that makes it real time
+    """
+    filmed = gym.make(task, render_mode="rgb_array", render_size=size, **env)
+    single: VecEnv = DummyVecEnv([lambda: filmed])
     act = acting(policy)
-    with closing(gym.make(task, render_mode="rgb_array", render_size=size, **env)) as filmed:
-
-        def act_and_look(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
+    frames: list[np.ndarray] = []
+    images: list[np.ndarray] = []
+    actions: list[np.ndarray] = []
+    rewards: list[float] = []
+    with closing(wrap(single) if wrap else single) as venv:
+        assert isinstance(venv.action_space, spaces.Box)
+        venv.seed(seed)
+        obs: Any = venv.reset()
+        done = False
+        while not done:
             frames.append(np.asarray(filmed.render()))
-            return act(obs, info, step)
-
-        trajectory = record(filmed, act_and_look, seed)
-        return trajectory, frames, float(filmed.metadata.get("render_fps", 25))
+            images.append(obs[0, ..., -3:])  # of stacked images, the newest
+            actions.append(np.asarray(act(obs[0], {}, len(actions)), np.float32))
+            obs, reward, dones, (info,) = venv.step(actions[-1][None])
+            rewards.append(reward[0])
+            done = bool(dones[0])
+        images.append(info["terminal_observation"][..., -3:])
+    terminated = not info["TimeLimit.truncated"]
+    trajectory = Trajectory(
+        np.stack(images), np.stack(actions), np.array(rewards, np.float32), terminated
+    )
+    return trajectory, frames, float(filmed.metadata.get("render_fps", 25))

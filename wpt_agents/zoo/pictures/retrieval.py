@@ -12,7 +12,7 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.pictures.runs import COLOURS, INK, plt
+from wpt_agents.zoo.pictures.runs import AGENT, CLONE, INK, plt
 from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, kind
 
 
@@ -84,7 +84,7 @@ def retrieval_sheet(
             robot, task = dataset.embodiments[i], dataset.tasks[i]
             same = query.embodiment is not None and robot == query.embodiment
             first = next(dataset.subset([i]).first_observations())[0]
-            draw(axis, first, COLOURS["WPT"] if same else COLOURS["prior actor"], 2)
+            draw(axis, first, AGENT if same else CLONE, 2)
             axis.set_title(
                 f"#{i}  d {distance:.3g}\n{kind(task, robot)}", fontsize=6.5, color=INK, pad=3
             )

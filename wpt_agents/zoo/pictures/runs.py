@@ -1,4 +1,4 @@
-"""What one wants to look at after a run: the learning curve, the policy's video, the dream."""
+"""The pictures of a run: its learning curve, a video of its policy, a strip of predictions."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,13 @@ matplotlib.use("Agg")  # no display
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.result import NOTHING, PRIOR_ACTOR, RANDOM, Score, final_policy
 
-INK, MUTED = "#1f2933", "#8a94a0"
-COLOURS = {"nothing": "#b0b7bf", "random": "#7f8a96", "prior actor": "#d98324", "WPT": "#2463a8"}
+INK = "#1f2933"
+MUTED = "#8a94a0"
+AGENT = "#2463a8"  # the colour of the agent, and of the query's own robot
+CLONE = "#d98324"  # the colour of the prior actor, and of other robots
+COLOURS = {NOTHING: "#b0b7bf", RANDOM: "#7f8a96", PRIOR_ACTOR: CLONE}
 
 
 def learning_curve(
@@ -28,27 +31,27 @@ def learning_curve(
     evaluations: tuple[np.ndarray, np.ndarray] | None = None,
     window: int = 10,
 ) -> None:
-    """Draws training returns over simulator frames, and the final scores as lines and a bar.
+    """Draw training returns over simulator frames, and the final scores as lines and a bar.
 
     :param frames: (N,), at the end of each training episode
     :param returns: (N,), of each training episode
-    :param scores: by policy; "WPT" becomes the point at the end
-    :param evaluations: frames (M,) and returns (M, episodes) of evaluations in between
+    :param scores: by policy; the final one becomes the point at the end
+    :param evaluations: frames (M,) and returns (M, episodes) of evaluations during fine-tuning
     """
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    axes.plot(frames, returns, ".", color=COLOURS["WPT"], alpha=0.3, label="training episodes")
+    axes.plot(frames, returns, ".", color=AGENT, alpha=0.3, label="training episodes")
     if len(returns) >= window:
         smooth = np.convolve(returns, np.ones(window) / window, "valid")
         label = f"their mean over {window}"
-        axes.plot(frames[window - 1 :], smooth, color=COLOURS["WPT"], lw=2, label=label)
+        axes.plot(frames[window - 1 :], smooth, color=AGENT, lw=2, label=label)
     if evaluations is not None:
-        at, each = evaluations
-        axes.plot(at, each.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
+        at, episodes = evaluations
+        axes.plot(at, episodes.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
     for name, score in scores.items():
-        if name == "WPT":
+        if name == final_policy(scores):
             _final_point(axes, max(frames, default=0), score)
         else:
-            mean = score.interval[0]
+            mean = score.mean
             axes.axhline(mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
             text = f"{name} {mean:.0f}"
             axes.annotate(text, (0.01, mean), xycoords=("axes fraction", "data"), va="bottom")
@@ -61,11 +64,11 @@ def learning_curve(
 
 
 def _final_point(axes: Axes, at: float, score: Score) -> None:
-    """The evaluation at the end, with its 95 % interval."""
+    """Draw the score at the end with its 95 % interval."""
     mean, low, high = score.interval
     bar = [[mean - low], [high - mean]] if low is not None and high is not None else None
-    style: dict[str, Any] = {"fmt": "D", "color": COLOURS["WPT"], "mec": "white", "ms": 9}
-    label = f"WPT at the end, {mean:.0f}"
+    style: dict[str, Any] = {"fmt": "D", "color": AGENT, "mec": "white", "ms": 9}
+    label = f"the agent at the end, {mean:.0f}"
     axes.errorbar([at], [mean], bar, label=label, capsize=4, zorder=3, **style)
 
 
@@ -77,7 +80,7 @@ def prediction_strip(
     context: int,
     columns: int = 12,
 ) -> None:
-    """Draws true images above open-loop predicted ones, the observed part set apart.
+    """Draw true images above open-loop predicted ones, the observed part in another colour.
 
     :param true: (T, 64, 64, 3) uint8
     :param predicted: (T, 64, 64, 3) uint8; the first `context` are reconstructions
@@ -93,7 +96,7 @@ def prediction_strip(
         for row, images in enumerate((true, predicted)):
             axes[row, column].imshow(images[step])
             axes[row, column].set(xticks=[], yticks=[])
-            axes[row, column].spines[:].set_color(COLOURS["WPT"] if step < context else INK)
+            axes[row, column].spines[:].set_color(AGENT if step < context else INK)
         label = f"step {step}\nseen" if step < context else f"+{step - context + 1}"
         axes[0, column].set_title(label, fontsize=9, color=INK)
     axes[0, 0].set_ylabel("true")
@@ -104,7 +107,7 @@ def prediction_strip(
 
 
 def video(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
-    """Writes an mp4 that plays in any browser.
+    """Write an mp4 that plays in any browser.
 
     :param frames: each (H, W, 3) uint8, H and W multiples of 16
     """

@@ -1,40 +1,109 @@
-"""The methods that the runner knows: an agent, its keywords, and the shared stages it needs."""
+"""The methods that the runner knows: an agent, its keywords, and the shared stages it needs.
 
-from collections.abc import Mapping
+To add a method of WPT, add one entry to `METHODS` with the keywords that differ from the preset.
+To add another agent, write it as a file of `wpt_agents/agents/` and name its class here::
+
+    "drq-v2": Method(DrQv2, shared=("size", "learning_starts"), pretrained=False, needs_data=False),
+
+The stages (`wpt_agents.zoo.run`) ask of an agent what Stable-Baselines3 asks, so its own algorithms
+run too: `agent(policy, env, seed=, device=, **keywords)`, `learn`, `predict`, `save`, `load`. They
+use what else there is: keywords `dataset`, `embodiment` and `episode_length` in the signature, a
+classmethod `pretrain` (required if `pretrained`), `prior` (the policy scored as "prior actor"),
+`build_index`, `open_loop`, `updates`, and a `replay_buffer` of `wpt_agents.data.replay` together
+with `episodes`, without which a killed run begins again instead of resuming.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.names import unknown_name
+
+# What the stages themselves hand to an agent, so no preset may.
+RESERVED = {
+    *("self", "policy", "env", "dataset", "seed", "device", "verbose", "tensorboard_log"),
+    *("embodiment", "episode_length", "policy_kwargs"),
+}
 
 
 @dataclass(frozen=True)
 class Method:
-    """Which of the paper's parts are on.
+    """One algorithm with its settings.
 
-    :param wpt: keywords of WPT that switch the others off
+    :param agent: the class
+    :param keywords: of the agent; they overrule the preset's
+    :param pretrained: whether it starts from a pre-trained model
+    :param needs_data: whether it uses the data that were collected
+    :param shared: keywords of the preset's section `wpt` that the agent takes under the same name;
+        None for all, as WPT does
+    :param policy: the first argument of the agent
+    :param wrap: what the agent puts around its environments, e.g. a stack of frames
     """
 
+    agent: type[BaseAlgorithm] = WPT
+    keywords: Mapping[str, Any] = field(default_factory=dict)
     pretrained: bool = True
     needs_data: bool = True
-    wpt: Mapping[str, Any] = field(default_factory=dict)
+    shared: tuple[str, ...] | None = None
+    policy: str = "WPTPolicy"
+    wrap: Callable[[VecEnv], VecEnv] | None = None
+
+    @property
+    def section(self) -> str:
+        """The section of `config.yaml` that holds the agent's keywords."""
+        return self.agent.__name__.lower()
+
+    def settings(self, preset: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the keywords that the agent is made with, the preset's section `wpt` included."""
+        kept = {k: v for k, v in preset.items() if self.shared is None or k in self.shared}
+        return {**kept, **self.keywords}
+
+    def takes(self, keyword: str) -> bool:
+        """Return whether the agent's constructor has this keyword."""
+        return keyword in inspect.signature(self.agent.__init__).parameters
+
+
+@cache
+def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
+    """Return the keywords of an agent that a preset or a method may set, with their defaults."""
+    return {
+        name: parameter.default
+        for name, parameter in inspect.signature(agent.__init__).parameters.items()
+        if name not in RESERVED and not name.startswith("_")
+    }
 
 
 ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
-
-
 METHODS = {
     "wpt": Method(),
-    "kickstart": Method(wpt={"kickstart": 20.0}),
-    "scratch": Method(False, False, ALONE),
-    "pretrain-only": Method(wpt=ALONE),
-    "no-guidance": Method(wpt={"guidance": 0.0, "kickstart": 0.0}),
-    "no-rehearsal": Method(wpt={"offline_ratio": 0.0}),
+    "kickstart": Method(keywords={"kickstart": 20.0}),
+    "scratch": Method(keywords=ALONE, pretrained=False, needs_data=False),
+    "pretrain-only": Method(keywords=ALONE),
+    "no-guidance": Method(keywords={"guidance": 0.0, "kickstart": 0.0}),
+    "no-rehearsal": Method(keywords={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
-    "random-retrieval": Method(wpt={"retrieval": "random"}),
+    "random-retrieval": Method(keywords={"retrieval": "random"}),
 }
-
-
+# The methods of the ablation in Fig. 5, by the parts that are on.
 ABLATION = {
     "scratch": "none",
     "pretrain-only": "P",
     "no-guidance": "P+ER",
     "wpt": "P+ER+G",
-}  # Fig. 5
+}
+
+
+def find_method(name: str) -> Method:
+    """Return the method of this name.
+
+    :raises ValueError: there is none
+    """
+    if name not in METHODS:
+        raise unknown_name("method", name, METHODS)
+    return METHODS[name]

@@ -5,26 +5,28 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from wpt_agents.files.names import counted
-from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 
 
 def show_plan(jobs: Sequence[Run], force: bool) -> None:
-    """Prints what would be done, and what is there already."""
+    """Print what would be done, and what exists already."""
     table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
     for job in jobs:
-        state = "finished" if job.result() and not force else "to do"
-        numbers = f"{job.preset.steps:,}", f"{job.updates:,}"
+        state = "finished" if read_result(job.folder) and not force else "to do"
+        updates = "-" if job.updates is None else f"{job.updates:,}"
         names = short_name(job.task), job.method, str(job.seed)
-        table.add_row(*names, *numbers, state, str(job.folder))
+        table.add_row(*names, f"{job.preset.steps:,}", updates, state, str(job.folder))
     console.print(table)
-    shared = {job.shared.model_path: job.shared for job in jobs if METHODS[job.method].needs_data}
-    for path, each in shared.items():
-        episodes = each.preset.collect.episodes * len(each.tasks)
-        state = "there" if each.data_path.exists() else f"{counted(episodes, 'episode')} to collect"
-        console.print(f"dataset      {state}  [dim]{each.data_path}")
-        done = (path / "done.json").exists()
-        state = "there" if done else f"{counted(each.preset.pretrain.steps, 'update')} to make"
+    datasets = {job.shared.data_path: job.shared for job in jobs if job.algorithm.needs_data}
+    for path, shared in datasets.items():
+        episodes = counted(shared.preset.collect.episodes * len(shared.tasks), "episode")
+        state = "exists" if path.exists() else f"{episodes} to collect"
+        console.print(f"dataset      {state}  [dim]{path}")
+    models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
+    for path, shared in models.items():
+        updates = counted(shared.preset.pretrain.steps, "update")
+        state = "exists" if (path / "done.json").exists() else f"{updates} to make"
         console.print(f"world model  {state}  [dim]{path}")

@@ -1,6 +1,5 @@
 """What a run is to do: zoo/<suite>.yaml, read, merged and checked before any work begins."""
 
-import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -11,12 +10,7 @@ import yaml
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
-
-# What the runner itself hands to WPT, so no preset may.
-OWN_KEYWORDS = {
-    *("policy", "env", "dataset", "seed", "device", "verbose", "tensorboard_log"),
-    *("embodiment", "episode_length"),  # the task's
-}
+from wpt_agents.zoo.plan.methods import defaults
 
 
 @dataclass(frozen=True)
@@ -158,13 +152,9 @@ class Preset:
         return given | {"collect": given["collect"] | {"tasks": list(self.collect.tasks)}}
 
 
-def wpt_keywords() -> dict[str, Any]:
-    """The keyword arguments of WPT that a preset may set, with their defaults."""
-    return {
-        name: parameter.default
-        for name, parameter in inspect.signature(WPT.__init__).parameters.items()
-        if name not in OWN_KEYWORDS | {"self"} and not name.startswith("_")
-    }
+def wpt_keywords() -> Mapping[str, Any]:
+    """Return the keyword arguments of WPT that a preset may set, with their defaults."""
+    return defaults(WPT)
 
 
 class _Loader(yaml.SafeLoader):

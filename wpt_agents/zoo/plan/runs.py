@@ -1,9 +1,8 @@
-"""From the words of a command to the runs that it asks for, all checked before any begins."""
+"""Runs as data, and from the words of a command to the list of them, checked before any begins."""
 
-import json
 import shlex
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,30 +11,33 @@ import numpy as np
 from wpt_envs.rendering import QUALITIES
 from wpt_envs.tasks import Task
 
+from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import unknown_name
 from wpt_agents.training.checks import check_hyperparameters
 from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
-from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset, wpt_keywords
-from wpt_agents.zoo.run.shared import Shared
+from wpt_agents.zoo.plan.shared import Shared
+from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
 
 EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
 
 
 def this_command() -> str:
-    """The command that this process was started with."""
+    """Return the command that this process was started with."""
     return shlex.join([sys.executable, *sys.orig_argv[1:]])
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run, fully told before it begins.
+    """One run: a task, a method and a seed under the settings of a preset. Data, no more.
 
-    :param changes: of the preset, each "key=value"
-    :param data_name: how the data's folder was written; `data` itself may be made absolute
+    :param changes: of the preset, sorted by key
+    :param data: the user's own dataset, None for the preset's
+    :param data_name: how the user wrote `data`, which may have been made absolute since
     :param command: what the user typed, whichever process does the run
     """
 
@@ -48,20 +50,24 @@ class Run:
     workers: int = 2
     device: str = "auto"
     data: Path | None = None
-    changes: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
     data_name: str = ""
     command: str = field(default_factory=this_command, compare=False)
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise unknown_name("method", self.method, METHODS)
+        find_method(self.method)
 
     @property
-    def label(self) -> str:
-        """The preset's name and what was changed of it, but for `frames`, which stand apart."""
-        changes = [c for c in self.changes if not c.startswith("learn.frames=")]
-        own_data = [f"data={self.data_name or self.data}"] if self.data is not None else []
-        return shlex.join([self.preset_name, *sorted(changes), *own_data])
+    def algorithm(self) -> Method:
+        """The method of this name: agent, keywords, and what it needs."""
+        return find_method(self.method)
+
+    @property
+    def variant(self) -> Variant:
+        """The preset with all that was changed of it but the budget, which stands apart."""
+        changes = tuple(sorted(c for c in self.changes if c.key != "learn.frames"))
+        data = self.data_name or str(self.data) if self.data is not None else None
+        return Variant(self.preset_name, changes, data)
 
     @property
     def folder(self) -> Path:
@@ -70,29 +76,45 @@ class Run:
         return self.out / self.preset_name / self.method / name
 
     @property
+    def title(self) -> str:
+        """What the run is, for a heading: task, method and seed."""
+        return f"{short_name(self.task)}, {self.method}, seed {self.seed}"
+
+    @property
     def shared(self) -> Shared:
         """The stages that this run shares with others."""
         cache = self.out / "cache"
-        return Shared(self.preset, self.task.suite, cache, self.workers, self.device, self.data)
+        agent = self.algorithm.agent
+        return Shared(
+            self.preset, self.task.suite, cache, self.workers, self.device, self.data, agent=agent
+        )
 
     @property
-    def wpt(self) -> dict[str, Any]:
-        """The keywords of WPT, the method's switches included."""
-        return {**self.preset.wpt, **METHODS[self.method].wpt}
+    def keywords(self) -> dict[str, Any]:
+        """The keywords of the agent, the method's own included."""
+        return self.algorithm.settings(self.preset.wpt)
+
+    @property
+    def full_keywords(self) -> Mapping[str, Any]:
+        """The keywords of the agent with the defaults of those that nobody set."""
+        return {**defaults(self.algorithm.agent), **self.keywords}
 
     @property
     def retrieves(self) -> bool:
-        """Whether trajectories are retrieved, for rehearsal or for guidance."""
-        wpt = wpt_keywords() | self.wpt
-        clones = ever(parse_schedule(wpt["guidance"])) or ever(
-            parse_schedule(wpt["kickstart"], np.inf)
-        )
-        return METHODS[self.method].needs_data and bool(wpt["offline_ratio"] or clones)
+        """Whether the run needs trajectories of the task's own robot from the dataset."""
+        if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
+            return self.algorithm.needs_data
+        wpt = self.full_keywords
+        guided = ever(parse_schedule(wpt["guidance"]))
+        imitates = ever(parse_schedule(wpt["kickstart"], np.inf))
+        return bool(wpt["offline_ratio"]) or guided or imitates
 
     @property
-    def updates(self) -> int:
-        """The fine-tuning updates that the run will make, within an episode's worth."""
-        wpt = wpt_keywords() | self.wpt
+    def updates(self) -> int | None:
+        """The updates that fine-tuning will make, within an episode's worth; None if unknown."""
+        if not issubclass(self.algorithm.agent, WPT):
+            return None
+        wpt = self.full_keywords
         if self.preset.steps < wpt["learning_starts"]:
             return 0
         earned = self.preset.steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"])
@@ -100,30 +122,22 @@ class Run:
 
     @property
     def evaluation_seed(self) -> int:
-        """Where evaluation's episodes start; below 2**31, as some simulators want."""
+        """The seed of evaluation's episodes; below 2**31, as some simulators require."""
         state = np.random.SeedSequence([self.seed, EVALUATION]).generate_state(1)
         return int(state[0] >> 1)
 
     def config(self) -> dict[str, Any]:
-        """The resolved configuration, as `config.yaml` holds it."""
-        about = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
-        return {
-            **about,
-            "seed": self.seed,
-            "preset": self.preset_name,
-            **({"data": self.shared.data_source} if self.data is not None else {}),
-            **self.preset.as_dict(),
-            "wpt": self.wpt,
-        }
-
-    def result(self) -> dict[str, Any] | None:
-        """What `result.json` holds, None while the run is not finished."""
-        path = self.folder / "result.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        """Return the resolved configuration, as `config.yaml` holds it."""
+        names = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
+        data = {"data": self.shared.data_source} if self.data is not None else {}
+        sections = self.preset.as_dict()
+        del sections["wpt"]
+        own = {self.algorithm.section: self.keywords}
+        return {**names, "seed": self.seed, "preset": self.preset_name, **data, **sections, **own}
 
 
 def parse_seeds(text: str) -> list[int]:
-    """'3' is 0, 1, 2; '0,5' is 0 and 5; '2-4' is 2, 3, 4."""
+    """Read '3' as 0, 1, 2; '0,5' as 0 and 5; '2-4' as 2, 3, 4."""
     try:
         if text.strip().isdigit():
             seeds = list(range(int(text)))
@@ -149,68 +163,97 @@ def make_plan(
     device: str,
     data: Path | None = None,
 ) -> list[Run]:
-    """One run for each task, method and seed; every name and setting is valid, or ValueError."""
-    rows, resolved = find_tasks(suite, tasks), load_preset(suite, preset, settings)
+    """Return one run for each task, method and seed.
+
+    :raises ValueError: an invalid name or setting
+    """
+    rows = find_tasks(suite, tasks)
+    resolved = load_preset(suite, preset, settings)
     for row in rows:
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
-    check_hyperparameters({**wpt_keywords(), **resolved.wpt})
+    check_preset(resolved)
+    changes = tuple({c.key: c for c in map(Change.parse, settings)}.values())
+    names = list(dict.fromkeys(methods))
+    for name in names:
+        check_changes(name, changes)
+    runs = [
+        Run(
+            task=row,
+            seed=seed,
+            method=name,
+            preset_name=preset,
+            preset=resolved,
+            out=out,
+            workers=workers,
+            device=device,
+            data=data,
+            changes=changes,
+            data_name=str(data or ""),
+        )
+        for row in rows
+        for name in names
+        for seed in parse_seeds(seeds)
+    ]
+    widths = action_widths(suite, resolved, data)
+    for run in runs:
+        check_width(run, widths)
+    return runs
+
+
+def action_widths(suite: str, preset: Preset, data: Path | None) -> set[int]:
+    """Return the numbers of actions that occur in the data."""
+    if data is not None:
+        return set(TrajectoryDataset.open(data).action_dims)
+    return {row.action_dim for row in find_tasks(suite, preset.collect.tasks)}
+
+
+def check_preset(preset: Preset) -> None:
+    """Refuse values that the presets' types allow and the stages do not."""
+    check_hyperparameters({**wpt_keywords(), **preset.wpt})
     for name, value, known in (
-        ("env.rendering", resolved.env.rendering, QUALITIES),
-        ("collect.behaviour", resolved.collect.behaviour, set(BEHAVIOURS) - {"policy"}),
+        ("env.rendering", preset.env.rendering, QUALITIES),
+        ("collect.behaviour", preset.collect.behaviour, set(BEHAVIOURS) - {"policy"}),
     ):
         if value not in known:
             raise unknown_name(name, value, known)
-    collected = find_tasks(suite, resolved.collect.tasks)
-    widths = {row.action_dim for row in collected}
-    if data is not None:
-        widths = set(TrajectoryDataset.open(data).action_dims)
-    changes = tuple({setting.partition("=")[0]: setting for setting in settings}.values())
-    for method in dict.fromkeys(methods):
-        check_changes(method, changes)
-    fixed = preset, resolved, out, workers, device, data, changes, str(data or "")
-    jobs = [
-        Run(row, seed, method, *fixed)
-        for row in rows
-        for method in dict.fromkeys(methods)
-        for seed in parse_seeds(seeds)
-    ]
-    for job in jobs:
-        check_width(job, widths)
-    return jobs
 
 
-def check_changes(method: str, changes: Sequence[str]) -> None:
-    """Refuses a setting that the method itself sets, and so would overrule."""
-    if method not in METHODS:
-        raise unknown_name("method", method, METHODS)
+def check_changes(name: str, changes: Sequence[Change]) -> None:
+    """Refuse a setting that the method overrules or its agent does not take."""
+    method = find_method(name)
     for change in changes:
-        name, _, value = change.partition("=")
-        if name.removeprefix("wpt.") in (own := METHODS[method].wpt):
-            own_value = own[name.removeprefix("wpt.")]
+        keyword = change.key.removeprefix("wpt.")
+        if keyword in method.keywords:
             raise ValueError(
-                f"--method {method} means {name}={own_value}, so --set {name}={value} would have "
-                "no effect: leave it out, or take --method wpt"
+                f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "
+                "would have no effect: leave it out, or take --method wpt"
+            )
+        if method.shared is not None and keyword in wpt_keywords().keys() - set(method.shared):
+            raise ValueError(
+                f"--method {name} takes only {', '.join(method.shared) or 'none'} of WPT's "
+                f"keywords, so --set {change} would have no effect: leave it out"
             )
 
 
-def check_width(job: Run, widths: Collection[int]) -> None:
-    """Refuses a task that the model cannot act in, or whose robot the data do not show.
+def check_width(run: Run, widths: Collection[int]) -> None:
+    """Refuse a task that the model cannot act in, or whose robot does not occur in the data.
 
-    :param widths: of the actions in the data
+    :param widths: the numbers of actions that occur in the data
     """
-    needed, wpt, method = job.task.action_dim, wpt_keywords() | job.wpt, METHODS[job.method]
-    if job.retrieves and needed not in widths:
+    needed = run.task.action_dim
+    if run.retrieves and needed not in widths:
         raise ValueError(
-            f"{short_name(job.task)} has {needed} actions, and nothing in the data has as many "
+            f"{short_name(run.task)} has {needed} actions, and nothing in the data has as many "
             f"({', '.join(map(str, sorted(widths)))}): name other --tasks, add such a task to "
-            "collect.tasks (--set), give --data that hold it, or use --method scratch or "
+            "collect.tasks (--set), use --data that has one, or use --method scratch or "
             "pretrain-only"
         )
-    widest = max(needed, *widths) if method.needs_data else needed
-    if widest > wpt["max_action_dim"]:
-        whose = f"{short_name(job.task)} has" if needed == widest else "The data have"
+    limit = run.full_keywords.get("max_action_dim")
+    widest = max(needed, *widths) if run.algorithm.needs_data else needed
+    if limit is not None and widest > limit:
+        whose = f"{short_name(run.task)} has" if needed == widest else "The data have"
         raise ValueError(
-            f"{whose} {widest} actions, the preset's max_action_dim is "
-            f"{wpt['max_action_dim']}: --set max_action_dim={widest}"
+            f"{whose} {widest} actions, the preset's max_action_dim is {limit}: "
+            f"--set max_action_dim={widest}"
         )

@@ -5,12 +5,14 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import preset_folder
+from wpt_agents.zoo.result import Result, Variant
 from wpt_agents.zoo.statistics import (
     bootstrap,
     iqm,
@@ -28,22 +30,22 @@ Estimate = tuple[float, float | None, float | None]  # value, and its 95 % inter
 
 @dataclass(frozen=True, order=True)
 class Experiment:
-    """What is compared: runs of one method, preset and budget on a suite."""
+    """What is compared: the runs of one method, variant of a preset and budget on a suite."""
 
     suite: str
-    preset: str
+    variant: Variant
     frames: int
     method: str
 
     @classmethod
-    def of(cls, result: Mapping[str, Any]) -> "Experiment":
-        """The experiment that a run belongs to."""
-        return cls(result["suite"], result["preset"], result["frames"], result["method"])
+    def of(cls, result: Result) -> "Experiment":
+        """Return the experiment that a run belongs to."""
+        return cls(result.suite, result.variant, result.frames, result.method)
 
     @property
     def budget(self) -> str:
         """'demo, 8,000 frames'."""
-        return f"{self.preset}, {self.frames:,} frames"
+        return f"{self.variant}, {self.frames:,} frames"
 
 
 @dataclass(frozen=True)
@@ -61,28 +63,25 @@ class Reference:
 
 @cache
 def references() -> tuple[Reference, ...]:
-    """Every number of the paper's Tables 3 to 5, and of both baselines as their authors ran them.
+    """Return every number of the paper's Tables 3 to 5, and of the baselines by their authors.
 
     The method `ncrl` is WPT as its ICLR 2026 version prints it. The files `table*.csv` are the
     paper's tables; `official.csv` holds curves that the authors of DrQ-v2, DreamerV3 and MR.Q
     published, of tasks in Table 5.
     """
-    found = []
+    references = []
     folder = preset_folder() / "references"
     for path in (*sorted(folder.glob("table*.csv")), folder / "official.csv"):
         table = 5 if path.stem == "official" else int(path.stem[-1])
         with open(path, newline="") as file:
-            for row in csv.DictReader(file):
-                score = float(row["score"]) if row["score"] else None
-                about = row["suite"], row["task"], row["method"], int(row["samples"])
-                found.append(Reference(table, *about, score, row["source"]))
-    return tuple(found)
-
-
-def score_of(result: Mapping[str, Any], policy: str = "WPT") -> float:
-    """What a run counts for: WPT's success rate if the task counts successes, else its return."""
-    score = result["scores"][policy]
-    return score["success_rate"] if result["metric"] == "success" else score["mean"]
+            rows = [SimpleNamespace(**row) for row in csv.DictReader(file)]
+        for row in rows:
+            score = float(row.score) if row.score else None
+            samples = int(row.samples)
+            references.append(
+                Reference(table, row.suite, row.task, row.method, samples, score, row.source)
+            )
+    return tuple(references)
 
 
 def normalised(score: float, metric: str) -> float:
@@ -90,18 +89,20 @@ def normalised(score: float, metric: str) -> float:
     return score if metric == "success" else score / BEST_RETURN
 
 
-def by_experiment(results: Iterable[Mapping[str, Any]]) -> dict[Experiment, dict[str, list[float]]]:
-    """For each experiment and task, the normalised scores of its runs, by seed."""
-    found: dict[Experiment, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for result in sorted(results, key=lambda result: result["seed"]):
-        score = normalised(score_of(result), result["metric"])
-        found[Experiment.of(result)][result["task"]].append(score)
-    return {one: dict(found[one]) for one in sorted(found, key=order)}
+def by_experiment(results: Iterable[Result]) -> dict[Experiment, dict[str, list[float]]]:
+    """Return the normalised scores of the runs, by experiment and task, in the order of seeds."""
+    groups: dict[Experiment, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for result in sorted(results, key=lambda result: result.seed):
+        score = normalised(result.counted(), result.metric)
+        groups[Experiment.of(result)][result.task].append(score)
+    return {one: dict(groups[one]) for one in sorted(groups, key=order)}
 
 
-def order(one: Experiment) -> tuple[str, str, int, int]:
-    """The order that experiments are told in; methods as METHODS has them, wpt first."""
-    return one.suite, one.preset, one.frames, list(METHODS).index(one.method)
+def order(one: Experiment) -> tuple[str, Variant, int, int]:
+    """Return the place of an experiment; methods are in the order of METHODS, unknown ones last."""
+    names = list(METHODS)
+    place = names.index(one.method) if one.method in names else len(names)
+    return one.suite, one.variant, one.frames, place
 
 
 def aggregate(tasks: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
@@ -130,19 +131,28 @@ def improvement(
     return estimate(probability_of_improvement, *groups), len(common)
 
 
+@dataclass(frozen=True)
+class Aggregate:
+    """The paper's mean and median over some tasks, normalised."""
+
+    mean: float
+    median: float
+
+
 def paper_aggregate(
     suite: str, tasks: Iterable[str], method: str, samples: int
-) -> dict[str, float]:
-    """The paper's mean and median over these tasks, normalised; empty if it has none of them."""
-    wanted, best = set(tasks), BEST_RETURN if suite == "dmc" else 1.0
+) -> Aggregate | None:
+    """Return the paper's mean and median over these tasks, None if it has none of them."""
+    names = set(tasks)
+    best = BEST_RETURN if suite == "dmc" else 1.0
     scores = [
         row.score / best
         for row in references()
         if (row.suite, row.method, row.samples) == (suite, method, samples)
-        and row.task in wanted
+        and row.task in names
         and row.score is not None
     ]
-    return {"mean": float(np.mean(scores)), "median": float(np.median(scores))} if scores else {}
+    return Aggregate(float(np.mean(scores)), float(np.median(scores))) if scores else None
 
 
 def misprint(row: Reference) -> float | None:

@@ -1,18 +1,16 @@
 """Run folders to and from the Hugging Face hub, with a model card. Needs the extra `hub`."""
 
-import json
 import re
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from wpt_agents.zoo.judge.trained import find_trained
 from wpt_agents.zoo.machine import import_extra
-from wpt_agents.zoo.report import record, tables
-from wpt_agents.zoo.report.aggregates import score_of
+from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.result import Result, read_result
 
 # What is shared; logs, replay and checkpoints stay at home.
 FILES = (
@@ -31,7 +29,8 @@ def push(folder: Path, name: str, private: bool = False) -> str:
     """
     _check(name)
     find_trained(folder)  # says what is missing, before anything is made
-    if not (folder / "result.json").exists():
+    result = read_result(folder)
+    if result is None:
         raise ValueError(f"{folder} has no result.json: only finished runs are pushed")
     api = import_extra("huggingface_hub", "hub").HfApi()
     with tempfile.TemporaryDirectory() as aside:
@@ -43,7 +42,7 @@ def push(folder: Path, name: str, private: bool = False) -> str:
         (Path(aside) / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         if (folder / "policy.mp4").exists():
             shutil.copy2(folder / "policy.mp4", Path(aside) / VIDEO)
-        (Path(aside) / "README.md").write_text(card(folder, name))
+        (Path(aside) / "README.md").write_text(card(result, name))
         address = api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(repo_id=name, folder_path=aside, commit_message="Upload a run")
     return str(address)
@@ -66,52 +65,44 @@ def _check(name: str) -> None:
         raise ValueError(f"{name!r} is no repository of the hub: write user/name")
 
 
-def card(folder: Path, name: str) -> str:
-    """The model card: metadata that the hub reads, scores of all policies, how to load it."""
-    result: dict[str, Any] = json.loads((folder / "result.json").read_text())
-    score = score_of(result)
-    value = {"type": result["metric"], "name": f"mean {result['metric']}", "value": score}
-    about = {
+def card(result: Result, name: str) -> str:
+    """Return the model card: metadata for the hub, the scores of all policies, how to load it."""
+    metric = result.metric
+    value = {"type": metric, "name": f"mean {metric}", "value": result.counted()}
+    found = {
+        "task": {"type": "reinforcement-learning", "name": result.task},
+        "dataset": {"type": result.suite, "name": result.task},
+        "metrics": [value],
+    }
+    repository = name.split("/")[1]
+    metadata = {
         "library_name": "wpt-agents",
         "license": "mit",
-        "tags": ["reinforcement-learning", "world-model", "stable-baselines3", result["task"]],
-        "model-index": [
-            {
-                "name": name.split("/")[1],
-                "results": [
-                    {
-                        "task": {"type": "reinforcement-learning", "name": result["task"]},
-                        "dataset": {"type": result["suite"], "name": result["task"]},
-                        "metrics": [value],
-                    }
-                ],
-            }
-        ],
+        "tags": ["reinforcement-learning", "world-model", "stable-baselines3", result.task],
+        "model-index": [{"name": repository, "results": [found]}],
     }
+    rows = tables.policies([result])
     return _CARD.format(
-        about=yaml.safe_dump(about, sort_keys=False),
-        table=tables.markdown_table(
-            tables.POLICY_HEADINGS, map(tables.policy_cells, tables.policies([result]))
-        ),
-        command=record.command(result),
+        metadata=yaml.safe_dump(metadata, sort_keys=False),
+        table=tables.markdown_table(tables.POLICY_HEADINGS, map(tables.policy_cells, rows)),
         name=name,
-        folder=name.split("/")[1],
-        **{key: result[key] for key in ("task", "method", "preset", "seed", "frames", "commit")},
+        folder=repository,
+        result=result,
     )
 
 
 _CARD = """---
-{about}---
-# {task}, {method}
+{metadata}---
+# {result.task}, {result.method}
 
-An agent of [wpt_agents](https://arxiv.org/abs/2502.19544), preset `{preset}`, seed {seed}, after
-{frames:,} simulator frames of `{task}`.
+An agent of [wpt_agents](https://arxiv.org/abs/2502.19544), preset `{result.variant}`,
+seed {result.seed}, after {result.frames:,} simulator frames of `{result.task}`.
 
 {table}
-Commit {commit}. Made by:
+Commit {result.commit}. Made by:
 
 ```bash
-{command}
+{result.command}
 ```
 
 Watch it:

@@ -1,28 +1,30 @@
 """The report as one HTML page: no network, no script that it needs, light and dark, any width."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import yaml
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted, unknown_name
-from wpt_agents.zoo.report import aggregates, sections, tables
+from wpt_agents.zoo.report import aggregates, headline, paper_tables, sections, tables
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
+from wpt_agents.zoo.report.names import policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
+from wpt_agents.zoo.result import Result, Score, Variant
 
 MEDIA = ("first", "all", "none")
 
 
 def write_page(folder: Path, path: Path, media: str = "first") -> None:
-    """Writes the page about all runs below `folder` to `path`, whole or not at all.
+    """Write the page about all runs below `folder` to `path`, as a whole or not at all.
 
-    :param media: videos and pictures of "all" runs, of the "first" of each task (its best-known
-        method's first seed), or of "none"; they make up most of the page's size
+    :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
+        seed of its best-known method), or of "none"; they make up most of the page's size
     """
     if media not in MEDIA:
         raise unknown_name("choice of media", media, MEDIA)
@@ -32,7 +34,7 @@ def write_page(folder: Path, path: Path, media: str = "first") -> None:
 
 
 def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: str = "first") -> str:
-    """The page's HTML."""
+    """Return the page's HTML."""
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     env.filters |= {
@@ -40,51 +42,75 @@ def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: st
         "share": "{:.2f}".format,
         "count": "{:,}".format,
         "counted": counted,
+        "interval": interval_of,
     }
     runs = sorted(runs, key=_order)
-    names, results = Names(run.experiment for run in runs), [run.result for run in runs]
-    suites = dict.fromkeys(run.result["suite"] for run in runs)
+    names = Names(run.experiment for run in runs)
+    results = [run.result for run in runs]
     return env.get_template("page.html.jinja").render(
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        suites=[sections.suite(name, runs, names) for name in suites],
-        tables=sections.paper_tables(runs, names),
+        suites=[
+            sections.section(suite, runs, names)
+            for suite in dict.fromkeys(result.suite for result in results)
+        ],
+        tables=paper_tables.paper_tables(runs, names),
         policies=tables.by_task(tables.policies(results)),
         policy_cells=tables.policy_cells,
         policy_headings=tables.POLICY_HEADINGS,
         runs=[card(run, names, media in illustrated(run, runs)) for run in runs],
         unfinished=unfinished,
-        headline=sections.headline(results),
-        both=sections.both_suites(results),
-        commits=sorted({run.result.get("commit") or "unknown" for run in runs}),
-        seeds=sorted({run.result["seed"] for run in runs}),
-        paper_budget=150_000,
+        headline=headline.headlines(results),
+        both=headline.both_suites(results),
+        commits=sorted({result.commit_name for result in results}),
+        seeds=sorted({result.seed for result in results}),
+        paper_budget=headline.PAPER_BUDGET,
     )
 
 
-def _order(run: Finished) -> tuple[Any, ...]:
-    suite, *others = aggregates.order(run.experiment)
-    return suite, run.result["task"], *others, run.result["seed"]
+def interval_of(score: Score) -> str:
+    """Write the 95 % interval of a score over its episodes."""
+    _, low, high = score.interval
+    return "–" if low is None else tables.interval_text(low, high)
+
+
+def _order(run: Finished) -> tuple[str, str, Variant, int, int, int]:
+    suite, variant, frames, method = aggregates.order(run.experiment)
+    return suite, run.result.task, variant, frames, method, run.result.seed
 
 
 def illustrated(run: Finished, runs: Sequence[Finished]) -> set[str]:
-    """Under which choices of media the run is shown with its pictures."""
-    first = next(one for one in runs if one.result["task"] == run.result["task"])
+    """Return the choices of media under which the run is shown with its pictures."""
+    first = next(one for one in runs if one.result.task == run.result.task)
     return {"all", "first"} if run is first else {"all"}
 
 
-def card(run: Finished, names: Names, pictures: bool) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Card:
     """Everything about one run: scores, command, seed, commit, versions, pictures."""
+
+    id: str
+    name: str
+    result: Result
+    scores: Mapping[str, Score]
+    command: str
+    config: str
+    system: str
+    media: Mapping[str, str]
+    seconds: float
+
+
+def card(run: Finished, names: Names, pictures: bool) -> Card:
+    """Return the card of a run."""
+    result = run.result
     system = json.loads(run.text("system.json") or "{}")
-    scores = {tables.POLICIES.get(n, n): s for n, s in run.result["scores"].items()}
-    return {
-        "id": run.name,
-        "name": names(run.experiment),
-        "score": aggregates.score_of(run.result),
-        "result": run.result,
-        "scores": scores,
-        "command": run.text("command.txt"),
-        "config": run.text("config.yaml"),
-        "system": yaml.safe_dump(system, sort_keys=False) if system else "",
-        "media": run.media() if pictures else {},
-        "seconds": sum(run.result["seconds"].values()),
-    }
+    return Card(
+        id=run.name,
+        name=names(run.experiment),
+        result=result,
+        scores={policy_title(policy_name(result, p)): s for p, s in result.scores.items()},
+        command=run.text("command.txt"),
+        config=run.text("config.yaml"),
+        system=yaml.safe_dump(system, sort_keys=False) if system else "",
+        media=run.media() if pictures else {},
+        seconds=sum(result.seconds.values()),
+    )

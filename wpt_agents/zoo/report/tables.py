@@ -1,21 +1,21 @@
-"""Results -> tables: one run's policies, and many runs' means over seeds."""
+"""Results as tables: the policies of one run, and the means of many runs over their seeds."""
 
 import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.files.names import counted
-from wpt_agents.zoo.report.aggregates import estimate, references, score_of
+from wpt_agents.zoo.report.aggregates import estimate, references
+from wpt_agents.zoo.report.names import policy_name, policy_title
+from wpt_agents.zoo.result import POLICIES, UNTRAINED, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
-
-POLICIES = {"nothing": "doing nothing", "random": "random policy"}  # as tables call them
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Row:
 
     task: str
     method: str
-    preset: str
+    preset: Variant
     frames: int
     seeds: int
     mean: float
@@ -37,12 +37,12 @@ class Row:
     paper: float | None
 
 
-def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:
-    """One row for each task, method, preset and budget."""
-    groups: dict[tuple[str, str, str, int], list[float]] = defaultdict(list)
+def summarise(results: Iterable[Result]) -> list[Row]:
+    """Return one row for each task, method, variant and budget."""
+    groups: dict[tuple[str, str, Variant, int], list[float]] = defaultdict(list)
     for result in results:
-        group = result["task"], result["method"], result["preset"], result["frames"]
-        groups[group].append(score_of(result))
+        group = result.task, result.method, result.variant, result.frames
+        groups[group].append(result.counted())
     paper = paper_scores()
     return [
         Row(*group, len(scores), *mean_interval(scores), paper.get(group[:2]))
@@ -54,20 +54,26 @@ def summarise(results: Iterable[Mapping[str, Any]]) -> list[Row]:
 class PolicyRow:
     """One policy on one task over its seeds, by return. Intervals are of 95 %.
 
-    :param method: "" for a policy that no method has a part in
-    :param means: of each seed, over its `episodes` episodes
-    :param episodes_low: bootstrap of the episodes within each seed: were these seeds played again;
-        None with one episode
-    :param seeds_low: bootstrap of the seeds' means: were other seeds trained; None with one seed
+    :param method: "" for an untrained policy
+    :param policy: one of `result.POLICIES`
+    :param name: what tables call it
+    :param final: whether its runs count for it
+    :param means: the mean of each seed over its `episodes` episodes
+    :param episodes_low: by a bootstrap of the episodes within each seed, as if these seeds were
+        played again; None with one episode
+    :param seeds_low: by a bootstrap of the seeds' means, as if other seeds were trained; None with
+        one seed
     :param t_low: the same by Student's t, which is wider for few seeds
-    :param success: share of episodes that end in success, None where the task counts none
+    :param success: the share of successful episodes, None where the task counts none
     """
 
     task: str
-    preset: str
+    preset: Variant
     frames: int
     method: str
     policy: str
+    name: str
+    final: bool
     episodes: int
     seeds: tuple[int, ...]
     means: tuple[float, ...]
@@ -82,21 +88,27 @@ class PolicyRow:
     commits: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls, group: tuple[str, str, int, str, str], runs: Mapping[int, Mapping[str, Any]]
-    ) -> Self:
-        """Builds the row from a policy's `scores` of each seed, each with its run's commit."""
-        seeds = sorted(runs)
-        returns = [np.array(runs[seed]["returns"], float) for seed in seeds]
-        means = [float(each.mean()) for each in returns]
-        rates = [runs[seed]["success_rate"] for seed in seeds]
+    def of(cls, policy: str, runs: Sequence[Result]) -> Self:
+        """Build the row of a policy from the runs of its method, one for each seed."""
+        runs = sorted(runs, key=lambda run: run.seed)
+        first = runs[0]
+        scores = [run.scores[policy] for run in runs]
+        returns = [np.array(score.returns, float) for score in scores]
+        means = [score.mean for score in scores]
+        rates = [score.success_rate for score in scores if score.success_rate is not None]
         _, episodes_low, episodes_high = estimate(mean, returns)
         _, seeds_low, seeds_high = estimate(mean, [np.array(means)])
         middle, t_low, t_high = mean_interval(means)
         return cls(
-            *group,
+            task=first.task,
+            preset=first.variant,
+            frames=first.frames,
+            method="" if policy in UNTRAINED else first.method,
+            policy=policy,
+            name=policy_name(first, policy),
+            final=policy == first.final_policy,
             episodes=min(map(len, returns)),
-            seeds=tuple(seeds),
+            seeds=tuple(run.seed for run in runs),
             means=tuple(means),
             mean=middle,
             episodes_low=episodes_low,
@@ -105,32 +117,31 @@ class PolicyRow:
             seeds_high=seeds_high,
             t_low=t_low,
             t_high=t_high,
-            success=None if None in rates else float(np.mean(rates)),
-            commits=tuple(sorted({runs[seed]["commit"] or "unknown" for seed in seeds})),
+            success=float(np.mean(rates)) if len(rates) == len(scores) else None,
+            commits=tuple(sorted({run.commit_name for run in runs})),
         )
 
 
-def policies(results: Iterable[Mapping[str, Any]]) -> list[PolicyRow]:
-    """One row for each task, preset, budget and policy; the untrained policies come first."""
-    groups: dict[tuple[str, str, int, str, str], dict[int, Mapping[str, Any]]] = defaultdict(dict)
+def policies(results: Iterable[Result]) -> list[PolicyRow]:
+    """Return one row for each task, variant, budget and policy; the untrained ones come first."""
+    groups: dict[tuple[str, Variant, int, str, str], dict[int, Result]] = defaultdict(dict)
     for result in results:
-        about = result["task"], result["preset"], result["frames"]
-        for policy, score in result["scores"].items():
-            method = "" if policy in POLICIES else result["method"]
-            commit = {"commit": result.get("commit")}
-            groups[*about, method, policy][result["seed"]] = score | commit
-    return [PolicyRow.of(*item) for item in sorted(groups.items(), key=_by_method)]
+        for policy in result.scores:
+            method = "" if policy in UNTRAINED else result.method
+            group = result.task, result.variant, result.frames, method, policy
+            groups[group][result.seed] = result  # untrained ones are the same for all methods
+    rows = [PolicyRow.of(group[-1], list(runs.values())) for group, runs in groups.items()]
+    return sorted(rows, key=_by_method)
 
 
-def _by_method(item: tuple[tuple[str, str, int, str, str], Any]) -> tuple[Any, ...]:
-    """The order of rows; within a method as the run reports them."""
-    (*about, method, policy), _ = item
-    order = (*POLICIES, "prior actor", "WPT")
-    return (*about, method, order.index(policy) if policy in order else len(order))
+def _by_method(row: PolicyRow) -> tuple[str, Variant, int, str, int]:
+    """Sort rows by method; within a method as the run reports them."""
+    place = POLICIES.index(row.policy) if row.policy in POLICIES else len(POLICIES)
+    return row.task, row.preset, row.frames, row.method, place
 
 
 def paper_scores() -> dict[tuple[str, str], float]:
-    """(task, method) -> the paper's score at 150,000 frames."""
+    """Return the paper's scores at 150,000 frames by task and method."""
     return {
         (row.task, row.method): row.score
         for row in references()
@@ -139,36 +150,38 @@ def paper_scores() -> dict[tuple[str, str], float]:
 
 
 def interval_text(low: float | None, high: float | None) -> str:
-    """A 95 % interval in a table's cell."""
+    """Write a 95 % interval for a table's cell."""
     return "-" if low is None or high is None else f"{number(low)} to {number(high)}"
 
 
 def number(value: float | None) -> str:
-    """A score with the digits that matter: 0.42, 7.3, 512."""
+    """Write a score with the digits that matter: 0.42, 7.3, 512."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 2 else 1 if abs(value) < 100 else 0
     return f"{value:.{digits}f}"
 
 
-def scores_table(result: Mapping[str, Any]) -> Table:
-    """The policies of one run side by side."""
-    about = f"{result['task']}, {result['method']}, seed {result['seed']}"
-    episodes = counted(len(result["scores"]["WPT"]["returns"]), "episode")
-    caption = f"{episodes} each, after {result['frames']:,} frames of fine-tuning"
-    table = Table(title=about, caption=caption)
+def scores_table(result: Result) -> Table:
+    """Return a table of the policies of one run."""
+    episodes = counted(len(result.final.returns), "episode")
+    caption = f"{episodes} each, after {result.frames:,} frames of fine-tuning"
+    title = f"{result.task}, {result.method}, seed {result.seed}"
+    table = Table(title=title, caption=caption)
     table.add_column("policy")
-    for heading in ("mean return", "95 % interval", "lowest", "highest"):
+    headings = ["mean return", "95 % interval", "lowest", "highest"]
+    if result.metric == "success":
+        headings.append("success")
+    for heading in headings:
         table.add_column(heading, justify="right")
-    successes = result["metric"] == "success"
-    if successes:
-        table.add_column("success", justify="right")
-    for name, score in result["scores"].items():
-        cells = number(score["mean"]), interval_text(score["low"], score["high"])
-        extremes = number(min(score["returns"])), number(max(score["returns"]))
-        style = "bold" if name == "WPT" else None
-        rate = [number(score["success_rate"])] if successes else []
-        table.add_row(POLICIES.get(name, name), *cells, *extremes, *rate, style=style)
+    for policy, score in result.scores.items():
+        mean, low, high = score.interval
+        cells = [number(mean), interval_text(low, high)]
+        cells += [number(min(score.returns)), number(max(score.returns))]
+        if result.metric == "success":
+            cells.append(number(score.success_rate))
+        style = "bold" if policy == result.final_policy else None
+        table.add_row(policy_title(policy_name(result, policy)), *cells, style=style)
     return table
 
 
@@ -176,14 +189,13 @@ HEADINGS = ("task", "method", "preset", "frames", "seeds", "mean", "95 % interva
 
 
 def cells(row: Row) -> list[str]:
-    """A row as text, in the order of HEADINGS."""
-    frames, interval = f"{row.frames:,}", interval_text(row.low, row.high)
-    about = [row.task, row.method, row.preset, frames, str(row.seeds)]
-    return [*about, number(row.mean), interval, number(row.paper)]
+    """Write a row as text, in the order of HEADINGS."""
+    names = [row.task, row.method, str(row.preset), f"{row.frames:,}", str(row.seeds)]
+    return [*names, number(row.mean), interval_text(row.low, row.high), number(row.paper)]
 
 
 def summary_table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Return the rows as a table for a terminal."""
     table = Table(caption="mean over seeds; interval over seeds by Student's t")
     for heading in HEADINGS:
         words = heading in ("task", "method", "preset")
@@ -194,12 +206,12 @@ def summary_table(rows: Sequence[Row]) -> Table:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
     return markdown_table(HEADINGS, map(cells, rows))
 
 
 def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Text in columns, as Markdown."""
+    """Return text in columns, as Markdown."""
     every = [headings, ["---"] * len(headings), *lines]
     return "".join(f"| {' | '.join(line)} |\n" for line in every)
 
@@ -211,22 +223,20 @@ POLICY_HEADINGS = (
 
 
 def policy_cells(row: PolicyRow) -> list[str]:
-    """A row as text, in the order of POLICY_HEADINGS."""
-    name = POLICIES.get(row.policy, row.policy)
-    success = "-" if row.success is None else f"{row.success:.2f}"
+    """Write a row as text, in the order of POLICY_HEADINGS."""
     return [
-        f"{name}, {row.method}" if row.method not in ("", "wpt") else name,
+        policy_title(row.name),
         ", ".join(map(number, row.means)),
         number(row.mean),
         interval_text(row.episodes_low, row.episodes_high),
         interval_text(row.seeds_low, row.seeds_high),
         interval_text(row.t_low, row.t_high),
-        success,
+        "-" if row.success is None else f"{row.success:.2f}",
     ]
 
 
-def by_task(rows: Iterable[PolicyRow]) -> dict[str, list[PolicyRow]]:
-    """The rows of each task, preset and budget, under a heading that names them."""
+def by_task(rows: Iterable[PolicyRow]) -> Mapping[str, Sequence[PolicyRow]]:
+    """Group the rows by task, variant and budget, under a heading that names them."""
     tables: dict[str, list[PolicyRow]] = defaultdict(list)
     for row in rows:
         tables[f"{row.task}, preset {row.preset}, {row.frames:,} frames"].append(row)
@@ -234,25 +244,26 @@ def by_task(rows: Iterable[PolicyRow]) -> dict[str, list[PolicyRow]]:
 
 
 def policy_markdown(rows: Sequence[PolicyRow]) -> str:
-    """A Markdown table for each task, seeds and commits under it."""
+    """Return a Markdown table for each task, with seeds and commits under it."""
     parts = []
     for title, table in by_task(rows).items():
         seeds = sorted({seed for row in table for seed in row.seeds})
         commits = sorted({commit for row in table for commit in row.commits})
         episodes = min(row.episodes for row in table)
-        about = f"Seeds {', '.join(map(str, seeds))}, {counted(episodes, 'episode')} each; "
-        about += f"commit {', '.join(commits)}."
+        note = f"Seeds {', '.join(map(str, seeds))}, {counted(episodes, 'episode')} each; "
+        note += f"commit {', '.join(commits)}."
         lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
-        parts.append(f"### {title}\n\n{lines}\n{about}\n")
+        parts.append(f"### {title}\n\n{lines}\n{note}\n")
     return "\n".join(parts)
 
 
 def policy_csv(rows: Sequence[PolicyRow]) -> str:
-    """The rows as CSV, unrounded; seeds, their means and commits are separated by spaces."""
+    """Return the rows as CSV, unrounded; seeds, their means and commits are separated by spaces."""
     file = io.StringIO()
-    writer = csv.DictWriter(file, [field.name for field in fields(PolicyRow)], lineterminator="\n")
-    writer.writeheader()
+    writer = csv.writer(file, lineterminator="\n")
+    names = [field.name for field in fields(PolicyRow)]
+    writer.writerow(names)
     for row in rows:
-        spaced = {k: " ".join(map(str, v)) for k, v in asdict(row).items() if isinstance(v, tuple)}
-        writer.writerow(asdict(row) | spaced)
+        values = [getattr(row, name) for name in names]
+        writer.writerow(" ".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
     return file.getvalue()

@@ -1,10 +1,11 @@
-"""Where a run stands, so that the same command goes on from there whatever ended the process.
+"""Where a run stands, so that the same command resumes it whatever ended the process.
 
 A checkpoint is a folder `checkpoints/step-N`: model file, logs so far, and `state.json` with the
-checksum of every other file. It is written aside and renamed, so it is whole or not there; the last
-two are kept. Episodes stand beside in `replay/`, one file each. Checkpoints are taken between two
-episodes, and all that is drawn depends on counters alone, so a run that goes on equals one that was
-never ended, bit for bit on a CPU. What came after the checkpoint never happened.
+checksum of every other file. It is written aside and renamed, so it is complete or not there; the
+last two are kept. Episodes stand beside in `replay/`, one file per episode. Checkpoints are taken
+between two episodes, and everything that is drawn depends on counters alone, so a resumed run
+equals one that was never interrupted, bit for bit on a CPU. Whatever came after the checkpoint is
+discarded.
 """
 
 import hashlib
@@ -14,18 +15,48 @@ import shutil
 import time
 import warnings
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.archive import sync_folder
 
-LOGS = ("0.monitor.csv", "progress.csv", "evaluations.npz", "best_model.zip")
+HEAD_START_MODEL = "head_start_model.zip"
+LOGS = ("0.monitor.csv", "progress.csv", "evaluations.npz", "best_model.zip", HEAD_START_MODEL)
 KEEP = 2
+STATE = "state.json"
+
+
+def resumes(agent: BaseAlgorithm) -> bool:
+    """Return whether checkpoints can hold all of the agent: it keeps whole episodes, as WPT."""
+    buffer = getattr(agent, "replay_buffer", None)
+    return isinstance(buffer, ReplayBuffer) and hasattr(agent, "episodes")
+
+
+@dataclass(frozen=True)
+class State:
+    """What `state.json` holds: everything beside the model file, the logs and the episodes.
+
+    :param seconds: wall-clock seconds of learning so far
+    :param replay: the number of episodes in the replay buffer
+    :param log: the means that were being logged
+    :param ep_info: SB3's information on the latest episodes
+    :param files: the checksum of every file of the checkpoint
+    :param cpu_seconds: processor seconds of learning so far; 0 in checkpoints of version 0.1
+    """
+
+    seconds: float
+    replay: int
+    log: Mapping[str, float]
+    ep_info: Sequence[Mapping[str, float]]
+    ep_success: Sequence[bool]
+    files: Mapping[str, str]
+    cpu_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -33,64 +64,82 @@ class Checkpoint:
     """A folder that `write_checkpoint` made."""
 
     folder: Path
-    state: dict[str, Any]
+    state: State
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read the state of a checkpoint."""
+        return cls(folder, State(**json.loads((folder / STATE).read_text())))
 
     @property
     def model(self) -> Path:
         """The model file."""
         return self.folder / "model.zip"
 
+    def check(self, run: Path) -> None:
+        """Check that every file is there and unchanged.
+
+        :raises ValueError: one is not
+        """
+        for name, checksum in self.state.files.items():
+            if _checksum(self.folder / name) != checksum:
+                raise ValueError(f"{name} has changed since it was written")
+        for i in range(self.state.replay):
+            if not _episode(run, i).exists():
+                raise ValueError(f"{_episode(run, i).name} is missing")
+
     def restore_logs(self, run: Path) -> None:
-        """Puts the run's logs back to what they were."""
+        """Replace the run's logs by those of the checkpoint."""
         for name in LOGS:
             (run / name).unlink(missing_ok=True)
-            if name in self.state["files"]:
+            if name in self.state.files:
                 shutil.copy2(self.folder / name, run / name)
 
-    def restore(self, model: WPT, run: Path) -> None:
-        """Puts back what the model file does not hold: episodes, and means being logged."""
-        model.replay_buffer, held = ReplayBuffer(), self.state["replay"]
-        for i in range(held):
+    def restore(self, agent: Any, run: Path) -> None:
+        """Restore what the model file does not hold: the episodes, and the means being logged.
+
+        :param agent: one that `resumes`
+        """
+        agent.replay_buffer = ReplayBuffer()
+        for i in range(self.state.replay):
             for trajectory in ReplayBuffer.load(_episode(run, i)).trajectories:
-                model.replay_buffer.add(trajectory)
-        for path in sorted((run / "replay").glob("episode-*"))[held:]:
+                agent.replay_buffer.add(trajectory)
+        for path in sorted((run / "replay").glob("episode-*"))[self.state.replay :]:
             path.unlink()
-        window = model._stats_window_size
-        model.ep_info_buffer = deque(self.state["ep_info"], maxlen=window)
-        model.ep_success_buffer = deque(self.state["ep_success"], maxlen=window)
-        for name, value in self.state["log"].items():
-            model.logger.record_mean(name, value)
+        window = agent._stats_window_size
+        agent.ep_info_buffer = deque(self.state.ep_info, maxlen=window)
+        agent.ep_success_buffer = deque(self.state.ep_success, maxlen=window)
+        for name, value in self.state.log.items():
+            agent.logger.record_mean(name, value)
 
 
-def write_checkpoint(model: WPT, run: Path, seconds: float = 0.0) -> None:
-    """Writes where `model` stands into the run's folder; no episode may be open.
+def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
+    """Write where the agent stands into the run's folder; no episode may be open.
 
-    :param seconds: spent on learning so far
+    :param agent: one that `resumes`
+    :param seconds: wall-clock seconds of learning so far
+    :param cpu_seconds: processor seconds of learning so far
     """
-    replay = model.replay_buffer.trajectories
-    for i, trajectory in enumerate(replay):
-        if not _episode(run, i).exists():
-            one = ReplayBuffer()
-            one.add(trajectory)
-            one.save(_episode(run, i))
-    folder = run / "checkpoints" / f"step-{model.num_timesteps:09}"
+    _write_episodes(agent, run)
+    folder = run / "checkpoints" / f"step-{agent.num_timesteps:09}"
     aside = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
-    model.save(aside / "model.zip")
+    agent.save(aside / "model.zip")
     for name in LOGS:
         if (run / name).exists():
             shutil.copy2(run / name, aside / name)
-    log = model.logger  # after an episode's updates each of its means has been recorded once
-    state = {
-        "seconds": seconds,
-        "replay": len(replay),
-        "log": {k: float(v) for k, v in log.name_to_value.items() if log.name_to_count[k]},
-        "ep_info": list(model.ep_info_buffer or []),
-        "ep_success": [bool(s) for s in model.ep_success_buffer or []],
-        "files": {path.name: _checksum(path) for path in sorted(aside.iterdir())},
-    }
-    (aside / "state.json").write_text(json.dumps(state))
+    log = agent.logger  # after an episode's updates each of its means has been recorded once
+    state = State(
+        seconds=seconds,
+        replay=len(agent.replay_buffer.trajectories),
+        log={k: float(v) for k, v in log.name_to_value.items() if log.name_to_count[k]},
+        ep_info=list(agent.ep_info_buffer or []),
+        ep_success=[bool(s) for s in agent.ep_success_buffer or []],
+        files={path.name: _checksum(path) for path in sorted(aside.iterdir())},
+        cpu_seconds=cpu_seconds,
+    )
+    (aside / STATE).write_text(json.dumps(asdict(state)))
     for path in aside.iterdir():
         with open(path, "rb") as file:
             os.fsync(file.fileno())
@@ -102,31 +151,35 @@ def write_checkpoint(model: WPT, run: Path, seconds: float = 0.0) -> None:
         shutil.rmtree(old)
 
 
+def _write_episodes(agent: Any, run: Path) -> None:
+    """Write the episodes of the replay buffer that have no file yet."""
+    for i, trajectory in enumerate(agent.replay_buffer.trajectories):
+        if not _episode(run, i).exists():
+            one = ReplayBuffer()
+            one.add(trajectory)
+            one.save(_episode(run, i))
+
+
 def last_checkpoint(run: Path) -> Checkpoint | None:
-    """The newest checkpoint that is whole; a damaged one is passed over, aloud."""
+    """Return the newest complete checkpoint; damaged ones are skipped with a warning."""
     for folder in _folders(run):
         try:
-            state = json.loads((folder / "state.json").read_text())
-            for name, checksum in state["files"].items():
-                if _checksum(folder / name) != checksum:
-                    raise ValueError(f"{name} is not as it was written")
-            for i in range(state["replay"]):
-                if not _episode(run, i).exists():
-                    raise ValueError(f"{_episode(run, i).name} is missing")
-            return Checkpoint(folder, state)
-        except (OSError, ValueError, KeyError) as error:
-            warnings.warn(f"{folder} is damaged and passed over: {error}", stacklevel=2)
+            checkpoint = Checkpoint.read(folder)
+            checkpoint.check(run)
+            return checkpoint
+        except (OSError, ValueError, TypeError) as error:
+            warnings.warn(f"{folder} is damaged and was skipped: {error}", stacklevel=2)
     return None
 
 
 def remove_checkpoints(run: Path) -> None:
-    """Frees the disk when a run is finished, or makes way for a new one."""
+    """Free the disk when a run is finished, or before a new one begins."""
     for name in ("checkpoints", "replay"):
         shutil.rmtree(run / name, ignore_errors=True)
 
 
 def _folders(run: Path) -> list[Path]:
-    """Newest first, by step."""
+    """The checkpoints' folders, newest first."""
     return sorted((run / "checkpoints").glob("step-*"), reverse=True)
 
 
@@ -142,34 +195,65 @@ def _checksum(path: Path) -> str:
 class Checkpoints(BaseCallback):
     """Writes a checkpoint between two episodes every so many steps, and at the end of learning.
 
-    :param every: steps; 0 for at the end only
-    :param seconds: spent on learning before
+    It also measures what learning costs, over all processes that took part in it in turn.
+
+    :param every: steps; 0 for at the end only, None for never
+    :param seconds: wall-clock seconds of learning in earlier processes
+    :param cpu_seconds: processor seconds of learning in earlier processes
     """
 
-    def __init__(self, run: Path, every: int, seconds: float = 0.0) -> None:
+    def __init__(
+        self, run: Path, every: int | None, seconds: float = 0.0, cpu_seconds: float = 0.0
+    ) -> None:
         super().__init__()
-        self.run, self.every, self.written = run, every, 0
-        self.begun = time.perf_counter() - seconds
+        self.run = run
+        self.every = every
+        self.written = 0
+        self.start = time.perf_counter() - seconds
+        self.cpu_start = time.process_time() - cpu_seconds
 
     @property
     def seconds(self) -> float:
-        """Spent on learning, in all processes that took part."""
-        return time.perf_counter() - self.begun
+        """Wall-clock seconds of learning, in all processes."""
+        return time.perf_counter() - self.start
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor seconds of the learning processes, all their threads."""
+        return time.process_time() - self.cpu_start
 
     def _on_training_start(self) -> None:
         self.written = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        assert isinstance(self.model, WPT)
         if self.every and self.model.num_timesteps - self.written >= self.every:
-            write_checkpoint(self.model, self.run, self.seconds)
+            write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
             self.written = self.model.num_timesteps
 
     def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:
-        assert isinstance(self.model, WPT)
         interrupted = self.model._last_obs is None  # by an error, in the middle of an episode
-        if not interrupted and self.model.num_timesteps > self.written:
-            write_checkpoint(self.model, self.run, self.seconds)
+        new = self.model.num_timesteps > self.written
+        if self.every is not None and new and not interrupted:
+            write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
+
+
+class HeadStart(BaseCallback):
+    """Saves the agent when the head start of its fine-tuning ends: after `actor_delay` updates.
+
+    Agents without a head start have no such keyword, or 0.
+    """
+
+    def __init__(self, run: Path) -> None:
+        super().__init__()
+        self.path = run / HEAD_START_MODEL
+
+    def _on_rollout_start(self) -> None:
+        delay = getattr(self.model, "actor_delay", 0)
+        if delay and not self.path.exists() and getattr(self.model, "updates", 0) >= delay:
+            self.model.save(self.path)
+
+    def _on_step(self) -> bool:
+        return True

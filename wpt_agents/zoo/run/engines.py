@@ -23,10 +23,12 @@ from rich.markup import escape
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.collect.workers import end_with_parent
 from wpt_agents.zoo.machine import check_machine, import_extra
-from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run import runner
+from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.locks import locked
+from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.run.watch import shown
 from wpt_agents.zoo.terminal import console, say
 
@@ -62,18 +64,18 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     check_machine(engine, jobs[0].device)
     jobs = [_at_absolute_paths(job) for job in jobs]
     for job in jobs:
-        runner.check_folder(job, force)
+        check_folder(job, force)
     engines: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
     chosen = engines[engine](given)
-    left = [job for job in jobs if force or job.result() is None]
+    left = [job for job in jobs if force or read_result(job.folder) is None]
     anew = [job.folder for job in left] if force else []
     with ExitStack() as held:
         for folder in anew:  # all of them, before anything is deleted
             held.enter_context(locked(folder / "lock"))
         for folder in anew:
-            runner.clear(folder)
-    by_need = sorted(left, key=lambda job: METHODS[job.method].pretrained)
-    shared = {job.shared.model_path: job for job in by_need if METHODS[job.method].needs_data}
+            clear(folder)
+    by_need = sorted(left, key=lambda job: job.algorithm.pretrained)
+    shared = {job.shared.model_path: job for job in by_need if job.algorithm.needs_data}
     runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")
     say("engine", f"{engine}: {len(left)} of {runs} to do, {cpus} each")
     with shown(jobs) as tick:
@@ -83,7 +85,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
         errors = chosen.map(do, left, tick)
     for folder, error in errors.items():
         console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")
-    return all(job.result() for job in jobs)
+    return all(read_result(job.folder) for job in jobs)
 
 
 def _at_absolute_paths(job: Run) -> Run:
@@ -94,9 +96,9 @@ def _at_absolute_paths(job: Run) -> Run:
 def make_shared(job: Run) -> None:
     """A job's work: what `job` shares with other runs."""
     with logged(job.out / "cache" / "log.txt"):
-        dataset = job.shared.data()
-        if METHODS[job.method].pretrained:
-            job.shared.model(dataset)
+        dataset = collect_data(job.shared)
+        if job.algorithm.pretrained:
+            pretrain(job.shared, dataset)
 
 
 def do(job: Run) -> None:

@@ -1,4 +1,4 @@
-"""The folder of a run: its lock, whose settings it holds, and how it is cleared."""
+"""The folder of a run: whose settings it holds, and how it is cleared."""
 
 import json
 import shutil
@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 
-from wpt_agents.zoo.plan.presets import wpt_keywords
+from wpt_agents.zoo.plan.methods import defaults
 from wpt_agents.zoo.plan.runs import Run
 
 
 def clear(folder: Path) -> None:
-    """Deletes what a run has left, all but its lock; first what says that it is finished."""
+    """Delete what a run has left but its lock; first what says that it is finished."""
     (folder / "result.json").unlink(missing_ok=True)
     for path in folder.iterdir():
         if path.is_dir():
@@ -23,13 +23,17 @@ def clear(folder: Path) -> None:
 
 
 def check_folder(job: Run, force: bool) -> None:
-    """Refuses to take a folder that is not this run's."""
+    """Refuse a folder that is not this run's.
+
+    :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
+    """
     path = job.folder / "config.yaml"
     others = {each.name for each in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
-        usual = {f"wpt.{name}": value for name, value in wpt_keywords().items()}
+        section = job.algorithm.section
+        usual = {f"{section}.{k}": v for k, v in defaults(job.algorithm.agent).items()}
         before = usual | _flat(yaml.safe_load(path.read_text()))
         wanted = usual | _flat(json.loads(json.dumps(job.config())))
         differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
@@ -41,9 +45,11 @@ def check_folder(job: Run, force: bool) -> None:
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """{'wpt': {'gamma': 1}} -> {'wpt.gamma': 1}."""
+    """Flatten {'wpt': {'gamma': 1}} into {'wpt.gamma': 1}."""
     flat: dict[str, Any] = {}
     for name, value in config.items():
-        sections = isinstance(value, dict)
-        flat |= {f"{name}.{k}": v for k, v in value.items()} if sections else {name: value}
+        if isinstance(value, dict):
+            flat |= {f"{name}.{key}": each for key, each in value.items()}
+        else:
+            flat[name] = value
     return flat

@@ -1,0 +1,101 @@
+"""What several runs share, as data: which dataset, which pre-trained model, and where they stand.
+
+Shared stages stand in `<out>/cache`, each in a folder named by a hash of all that it depends on.
+`wpt_agents.zoo.run.shared` makes them.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.plan.presets import Preset
+from wpt_agents.zoo.tasks import find_tasks
+
+# Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
+FINE_TUNING = {
+    *("actor_critic_learning_rate", "gamma", "lam", "ent_coef", "imagine_horizon", "return_norm"),
+    *(
+        "target_fraction",
+        "train_ratio",
+        "train_freq",
+        "learning_starts",
+        "warmup_steps",
+        "guidance",
+        "kickstart",
+    ),
+    *("offline_ratio", "retrieval", "num_retrieve"),
+    *("bc_steps", "bc_batch_size", "bc_learning_rate"),
+}
+
+
+def key(*parts: Any) -> str:
+    """Return a short hash of settings and of the library's version."""
+    text = json.dumps([version("wpt-agents"), *parts], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """The shared stages of a preset.
+
+    :param cache: the folder that holds them
+    :param workers: the number of processes that collect
+    :param device: the device to pre-train on
+    :param given_data: a dataset to use in place of the preset's
+    :param accumulate: the number of passes over a batch of pre-training
+    :param agent: the class that is pre-trained
+    """
+
+    preset: Preset
+    suite: str
+    cache: Path
+    workers: int = 2
+    device: str = "auto"
+    given_data: Path | None = None
+    accumulate: int = 1
+    agent: type[BaseAlgorithm] = WPT
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `gymnasium.make`."""
+        return asdict(self.preset.env)
+
+    @property
+    def tasks(self) -> list[str]:
+        """The ids of the tasks that data are collected on."""
+        return [row.id for row in find_tasks(self.suite, self.preset.collect.tasks)]
+
+    @property
+    def data_path(self) -> Path:
+        """The dataset's folder."""
+        if self.given_data is not None:
+            return self.given_data.resolve()
+        return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
+
+    @property
+    def model_path(self) -> Path:
+        """The folder of the pre-training: the model, its log, and `done.json` once it finished."""
+        parts = [asdict(self.preset.pretrain), self.pretraining, self.data_source]
+        if self.agent is not WPT:
+            parts.append(self.agent.__name__)
+        return self.cache / f"model-{key(*parts)}"
+
+    @property
+    def data_source(self) -> str:
+        """A name of the data that does not depend on where they lie."""
+        if self.given_data is None:
+            return self.data_path.name
+        return TrajectoryDataset.open(self.data_path).fingerprint
+
+    @property
+    def pretraining(self) -> Mapping[str, Any]:
+        """The preset's keywords of the agent that pre-training looks at."""
+        return {k: v for k, v in self.preset.wpt.items() if k not in FINE_TUNING}

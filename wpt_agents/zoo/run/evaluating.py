@@ -1,0 +1,99 @@
+"""Stage 5 of a run: the scores of all its policies, and pictures of the one that counts."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.names import counted
+from wpt_agents.zoo.judge.evaluation import evaluate, film
+from wpt_agents.zoo.judge.untrained import BASELINES
+from wpt_agents.zoo.pictures import runs as pictures
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.result import BEST, HEAD_START, LAST, PRIOR_ACTOR, Score
+from wpt_agents.zoo.run.checkpoints import HEAD_START_MODEL
+from wpt_agents.zoo.run.shared import play_untrained
+from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.terminal import say
+
+BEST_MODEL = "best_model.zip"
+CONTEXT = 5  # images that the world model sees before it predicts
+HORIZON = 40  # images that it then predicts
+
+
+def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:
+    """Stage 5: the scores of every policy of the run, from the same initial states."""
+    episodes = run.preset.evaluate.episodes
+    seed = run.evaluation_seed
+    say("evaluate", f"{counted(episodes, 'episode')} of each policy, from the same initial states")
+    scores = {name: play_untrained(run.shared, name, run.task, seed) for name in BASELINES}
+    for name, policy in policies(run, agent).items():
+        scores[name] = evaluate(
+            policy, run.task.id, run.shared.env, episodes, seed, name, run.algorithm.wrap
+        )
+    return scores
+
+
+def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
+    """Return the policies that the run has trained, by name."""
+    prior: PolicyPredictor | None = getattr(agent, "prior", None)
+    found = {PRIOR_ACTOR: prior} if prior is not None else {}
+    for name, file in ((HEAD_START, HEAD_START_MODEL), (BEST, BEST_MODEL)):
+        if (path := run.folder / file).exists():
+            found[name] = run.algorithm.agent.load(path, device=run.device)
+        if name == HEAD_START:
+            found[LAST] = agent
+    return found
+
+
+def final_agent(run: Run, agent: BaseAlgorithm) -> BaseAlgorithm:
+    """Return the agent that counts: the best one if the run kept it, else the last."""
+    best = run.folder / BEST_MODEL
+    return run.algorithm.agent.load(best, device=run.device) if best.exists() else agent
+
+
+def model_hash(folder: Path) -> str:
+    """Return the first digits of the SHA-256 of the model file that counts."""
+    best = folder / BEST_MODEL
+    with open(best if best.exists() else folder / "model.zip", "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+
+
+def draw(run: Run, agent: BaseAlgorithm, scores: Mapping[str, Score]) -> None:
+    """Draw the learning curve, film the policy that counts, and draw what its model predicts."""
+    say("pictures", "learning_curve.png, policy.mp4, predictions.png")
+    title = f"{short_name(run.task)}, {run.method}, preset {run.preset_name}, seed {run.seed}"
+    _draw_curve(run, title, scores)
+    final = final_agent(run, agent)
+    trajectory, shots, fps = film(
+        final, run.task.id, run.shared.env, run.evaluation_seed, wrap=run.algorithm.wrap
+    )
+    pictures.video(run.folder / "policy.mp4", shots, fps)
+    if isinstance(final, WPT):
+        predicted = final.open_loop(trajectory, CONTEXT, HORIZON)
+        true = trajectory.image[: len(predicted)]
+        path = run.folder / "predictions.png"
+        pictures.prediction_strip(path, title, true, predicted, CONTEXT)
+
+
+def _draw_curve(run: Run, title: str, scores: Mapping[str, Score]) -> None:
+    repeat = run.preset.env.action_repeat
+    monitor = np.genfromtxt(run.folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
+    training = np.atleast_1d(monitor)
+    path = run.folder / "evaluations.npz"
+    evaluated = None
+    if path.exists():
+        with np.load(path) as arrays:
+            evaluated = arrays["timesteps"] * repeat, arrays["results"]
+    pictures.learning_curve(
+        run.folder / "learning_curve.png",
+        title,
+        training["l"].cumsum() * repeat,
+        training["r"],
+        scores,
+        evaluated,
+    )

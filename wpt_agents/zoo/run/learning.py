@@ -1,0 +1,157 @@
+"""Stages 3 and 4 of a run: the index over the data, and fine-tuning."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.judge.evaluation import episode_steps, make_vec_env
+from wpt_agents.zoo.pictures import retrieval
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.run.checkpoints import Checkpoint, Checkpoints, HeadStart, resumes
+from wpt_agents.zoo.run.logs import ContinuedCSV, Evaluations, go_to_episode
+from wpt_agents.zoo.run.progress import LearningBar
+from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.terminal import say
+
+APART = 10_000  # between the seeds of the evaluations during fine-tuning and of those at its end
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What learning cost, in all processes that took part in it one after the other.
+
+    :param seconds: of wall-clock
+    :param cpu_seconds: of processor time of the learner's process, all its threads
+    """
+
+    seconds: float
+    cpu_seconds: float
+
+
+def make_training_env(run: Run) -> VecEnv:
+    """Make the task to learn, in a process of its own where updates are made while it steps."""
+    overlap = run.preset.learn.overlap and run.keywords.get("train_freq") == "step"
+    monitor = str(run.folder / "0.monitor.csv")
+    venv = make_vec_env(run.task.id, run.shared.env, run.seed, monitor=monitor, workers=overlap)
+    return run.algorithm.wrap(venv) if run.algorithm.wrap else venv
+
+
+def make_agent(
+    run: Run,
+    venv: VecEnv,
+    dataset: TrajectoryDataset | None,
+    start: Path | None,
+    checkpoint: Checkpoint | None = None,
+) -> BaseAlgorithm:
+    """Make the agent to fine-tune: from the checkpoint, from the pre-trained model, or new."""
+    method = run.algorithm
+    task = {
+        "dataset": dataset,
+        "embodiment": run.task.embodiment,
+        "episode_length": episode_steps(run.task.id, run.shared.env),
+    }
+    known = {name: value for name, value in task.items() if method.takes(name)}
+    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **run.keywords, **known}
+    agent: Any = without_progress_bar(method.agent)
+    if checkpoint is not None:
+        return agent.load(checkpoint.model, env=venv, **keywords)
+    if start is None:
+        return agent(method.policy, venv, **keywords)
+    model = agent.load(start, env=venv, **keywords)
+    model.reset_task()  # heads, actor and critic are drawn by this run's seed, not pre-training's
+    return model
+
+
+def without_progress_bar(agent: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
+    """Return the class without SB3's progress bar: the runner's stands among the callbacks."""
+
+    def init_callback(
+        self: BaseAlgorithm, callback: MaybeCallback, progress_bar: bool = False
+    ) -> BaseCallback:
+        return agent._init_callback(self, callback)
+
+    return type(agent.__name__, (agent,), {"_init_callback": init_callback})
+
+
+def build_index(run: Run, agent: BaseAlgorithm) -> None:
+    """Stage 3: the features of every first image, kept beside the dataset; a picture of it."""
+    if not isinstance(agent, WPT) or agent.dataset is None:
+        return
+    folder = Path(agent.dataset.path)
+    before = set(folder.iterdir())
+    retriever = agent.build_index(progress_bar=True)
+    state = "made" if set(folder.iterdir()) - before else "reused"
+    share = retriever.own_share()
+    same = "" if share is None else f", {share:.0%} of the nearest are of the query's own robot"
+    say("index", f"{state}, {len(retriever)} first images{same}  [dim]{agent.dataset.path}")
+    if run.retrieves and agent.retrieval == "nearest":
+        picture = run.folder / "retrieval.png"
+        retrieval.sheet_of_run(picture, agent, run.task, run.shared.env, run.seed)
+
+
+def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effort:
+    """Stage 4: fine-tuning, with evaluations during it where the preset asks for them."""
+    repeat = run.preset.env.action_repeat
+    steps = run.preset.steps
+    done = agent.num_timesteps * repeat
+    state = f"continued at {done:,} of " if checkpoint else ""
+    length = f"{state}{run.preset.learn.frames:,} frames, {steps:,} steps"
+    say("learn", f"{length} of {short_name(run.task)}, method {run.method}, seed {run.seed}")
+    outputs = [ContinuedCSV(run.folder / "progress.csv"), TensorBoardOutputFormat(str(run.folder))]
+    logger = Logger(str(run.folder), outputs)
+    agent.set_logger(logger)
+    before = Effort(0.0, 0.0)
+    if checkpoint is not None:
+        before = Effort(checkpoint.state.seconds, checkpoint.state.cpu_seconds)
+        resume(run, agent, checkpoint)
+    every = run.preset.learn.checkpoint_every // repeat
+    checkpoints = Checkpoints(
+        run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds
+    )
+    with closing(logger), evaluations(run) as evaluation:
+        callbacks = [LearningBar(repeat), *evaluation, HeadStart(run.folder), checkpoints]
+        agent.learn(
+            steps - agent.num_timesteps,
+            callback=callbacks,
+            log_interval=1,
+            reset_num_timesteps=False,
+            progress_bar=True,
+        )
+    return Effort(checkpoints.seconds, checkpoints.cpu_seconds)
+
+
+def resume(run: Run, agent: Any, checkpoint: Checkpoint) -> None:
+    """Restore what the model file does not hold, in the agent and in its environment."""
+    checkpoint.restore(agent, run.folder)
+    go_to_episode(agent.env, agent.episodes)
+
+
+@contextmanager
+def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
+    """Open the callback that evaluates every `evaluate.every` frames, into `evaluations.npz`."""
+    settings = run.preset.evaluate
+    if not settings.every:
+        yield []
+        return
+    venv = make_vec_env(run.task.id, run.shared.env, run.evaluation_seed + APART)
+    with closing(run.algorithm.wrap(venv) if run.algorithm.wrap else venv) as wrapped:
+        callback = Evaluations(
+            wrapped,
+            n_eval_episodes=settings.during_episodes,
+            eval_freq=max(1, settings.every // run.preset.env.action_repeat),
+            log_path=str(run.folder),
+            best_model_save_path=str(run.folder) if settings.keep_best else None,
+            deterministic=True,
+            verbose=0,
+        )
+        yield [callback]

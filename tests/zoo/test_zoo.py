@@ -308,7 +308,7 @@ def test_doing_nothing_earns_the_first_reward_at_every_step():
     score = evaluate(
         DoNothing(env.action_space), DOT.id, {"action_repeat": 1, "rendering": "fast"}, 1, 5
     )
-    assert score.returns == [pytest.approx(steps * env.reward(), rel=1e-5)]
+    assert list(score.returns) == [pytest.approx(steps * env.reward(), rel=1e-5)]
 
 
 def test_evaluations_and_training_start_from_different_seeds(tmp_path):

@@ -12,6 +12,7 @@ from wpt_agents.data.importers.hdf5 import Hdf5Episodes
 from wpt_agents.data.importers.lerobot import LeRobotEpisodes
 from wpt_agents.data.importers.minari import MinariEpisodes, local_minari
 from wpt_agents.data.importers.npz import NpzEpisodes
+from wpt_agents.data.importers.official import OfficialEpisodes, is_official
 from wpt_agents.data.importers.rlds import RldsEpisodes
 from wpt_agents.data.importers.sb3 import SB3Episodes
 from wpt_agents.files.names import unknown_name
@@ -21,6 +22,7 @@ FORMATS: dict[str, type[Episodes]] = {
     "lerobot": LeRobotEpisodes,
     "minari": MinariEpisodes,
     "npz": NpzEpisodes,
+    "official": OfficialEpisodes,
     "rlds": RldsEpisodes,
     "sb3": SB3Episodes,
 }
@@ -67,6 +69,8 @@ def recognise(source: Source | ReplayBuffer) -> str | None:
     if path.suffix in (".hdf5", ".h5"):
         return "hdf5"
     if path.is_dir():
+        if is_official(path):
+            return "official"
         for pattern, form in (("*.tfrecord*", "rlds"), ("*.npz", "npz")):
             if next(path.rglob(pattern), None):
                 return form

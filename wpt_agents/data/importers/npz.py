@@ -76,17 +76,23 @@ class NpzEpisodes(Episodes):
                 f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
                 "write a file an episode"
             )
-        action = arrays["action"][1:]
-        if self._limits:
-            action = rescaled(action, *self._limits)
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         return self._trajectory(
             arrays[key],
-            action,
+            self._rescaled(arrays["action"][1:]),
             arrays["reward"][1:] if "reward" in arrays else None,
             source=file.relative_to(self._folder).as_posix(),
             terminated=bool(np.ravel(over)[-1] == 1),
+            **self._labels(file),
         )
+
+    def _rescaled(self, action: np.ndarray) -> np.ndarray:
+        """(T, A) in the file's own limits -> (T, A) in [-1, 1]."""
+        return rescaled(action, *self._limits) if self._limits else action
+
+    def _labels(self, file: Path) -> dict[str, str]:
+        """What the file's path says of robot and task, where nothing else was asked for."""
+        return {}
 
 
 def _arrays(file: Path, names: set[str]) -> dict[str, np.ndarray]:

@@ -87,7 +87,9 @@ def collect_data(
 def import_data(
     form: Annotated[
         str,
-        typer.Argument(metavar="FORMAT", help="hdf5, lerobot, minari, npz, rlds, sb3, or auto."),
+        typer.Argument(
+            metavar="FORMAT", help="hdf5, lerobot, minari, npz, official, rlds, sb3 or auto."
+        ),
     ],
     source: Annotated[
         str, typer.Argument(metavar="SRC", help="A folder, a file, or a Minari dataset's name.")

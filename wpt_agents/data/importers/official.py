@@ -1,0 +1,60 @@
+"""The data that the paper's authors publish: `ncrl_datasets/<suite>/<domain or task>/*.npz`.
+
+Files are those of `NpzEpisodes`, one an episode, named `{time}-{id}-{number}-{length}.npz`. The
+folders are the labels: DMControl's are robots, Meta-World's are tasks of one robot.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wpt_agents.data.importers.npz import NpzEpisodes
+
+DMC, METAWORLD = SUITES = ("dmcontrol", "metaworld")
+
+
+class OfficialEpisodes(NpzEpisodes):
+    """The authors' episodes, in the order of their paths.
+
+    Actions beyond [-1, 1] are clipped, as the simulators did when the episodes were recorded.
+
+    :param folder: `ncrl_datasets`, or one of the folders in it
+    :raises ValueError: a folder that is not inside `dmcontrol` or `metaworld`, nor has them
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], **options: Any) -> None:
+        if not is_official(folder):
+            raise ValueError(
+                f"{folder} is not the authors' data: its path has neither {DMC!r} nor "
+                f"{METAWORLD!r}, whose folders name the robots and tasks; import it as npz"
+            )
+        super().__init__(folder, **options)
+
+    def _is_single(self, file: Path) -> bool:
+        length = file.stem.rpartition("-")[2]  # tens of thousands of files are not opened for it
+        return int(length) == 0 if length.isdecimal() else super()._is_single(file)
+
+    def _rescaled(self, action: np.ndarray) -> np.ndarray:
+        return action.clip(-1, 1)
+
+    def _labels(self, file: Path) -> dict[str, str]:
+        suite, *folders = _below_suite(file.parent)
+        name = folders[0] if folders else None
+        labels = {"embodiment": name} if suite == DMC else {"embodiment": "sawyer", "task": name}
+        return {k: v for k, v in labels.items() if v is not None and getattr(self, k) is None}
+
+
+def is_official(folder: str | os.PathLike[str]) -> bool:
+    """Whether a folder is one of the authors' suites, has them in it, or is in one of them."""
+    path = Path(folder)
+    inside = any((path / suite).is_dir() for suite in SUITES)
+    return inside or bool(_below_suite(path))
+
+
+def _below_suite(folder: Path) -> list[str]:
+    """The names on the way down to `folder`, from the last one that is a suite's."""
+    parts = Path(os.path.abspath(folder)).parts
+    found = [i for i, part in enumerate(parts) if part in SUITES]
+    return list(parts[found[-1] :]) if found else []

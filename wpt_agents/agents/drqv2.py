@@ -158,12 +158,16 @@ class DrQv2Policy(FramePolicy):
     def build(self) -> None:
         """Draws the networks for actions of width `action_dim`."""
         channels, features, hidden = self.widths
-        self.encoder: nn.Module = FrameEncoder((channels,) * 4, (2, 1, 1, 1), centre=0.5)
+        self.encoder = self.make_encoder(channels)
         shape = self.encoder.embed_dim, features, hidden, self.action_dim
         self.actor, self.critic = Actor(*shape), Critic(*shape)
-        for network in (self.encoder, self.actor, self.critic):
+        for network in (self.actor, self.critic):
             network.apply(orthogonal)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
+
+    def make_encoder(self, channels: int) -> Any:
+        """Draw an encoder: a module from frames to (N, `embed_dim`)."""
+        return FrameEncoder((channels,) * 4, (2, 1, 1, 1), centre=0.5).apply(orthogonal)
 
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
@@ -184,6 +188,7 @@ class DrQv2Learner:
         self.policy = policy
         self.given = given
         value = [*policy.encoder.parameters(), *policy.critic.parameters()]
+        value = [weight for weight in value if weight.requires_grad]  # R3M's encoder is frozen
         self.critic_optimizer = Adam(value, given.learning_rate, fused=True)
         self.actor_optimizer = Adam(policy.actor.parameters(), given.learning_rate, fused=True)
 
@@ -239,7 +244,7 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
     policy: DrQv2Policy
     learner: DrQv2Learner
     hyperparameters: DrQv2Keywords
-    shape_keywords = ("channels", "feature_dim", "hidden_dim")
+    shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "feature_dim", "hidden_dim")
 
     def make_policy(self) -> DrQv2Policy:
         """Make the networks, as wide as the environment's actions."""

@@ -1,6 +1,7 @@
 """What DrQ-v2, RLPD and MR.Q share as agents: stacked frames, n-step batches and offline data."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -163,6 +164,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             self.streams.numpy(Purpose.RETRIEVE, 0),
         )
 
+    def seen(self, replay: ReplayBuffer) -> Sequence[np.ndarray] | None:
+        """Return what stands for the episodes' images in a batch; None for the images."""
+        return None
+
     def draw(self, replay: ReplayBuffer, size: int, n_steps: int, stream: int = 0) -> Transitions:
         """Draw the batch of the next update from some episodes; its images are shifted at random.
 
@@ -171,7 +176,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         rng = np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
         given = self.hyperparameters
         shape = size, n_steps, given.gamma, self.policy.action_dim
-        return draw_transitions(replay.trajectories, *shape, rng, given.pad).to(self.device)
+        seen = self.seen(replay)
+        pad = given.pad if seen is None else 0
+        batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen)
+        return batch.to(self.device)
 
     def hyperparameters_changed(self) -> None:
         """Hand the keywords to the learner, and the learning rate to its optimisers."""

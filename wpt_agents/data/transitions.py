@@ -18,7 +18,7 @@ from wpt_agents.data.trajectory import Trajectory
 class Transitions:
     """N steps of behaviour and what came of each within n steps.
 
-    :param image: (N, F, 64, 64, 3) uint8, the frames up to o_s, oldest first
+    :param image: (N, F, 64, 64, 3) uint8, the frames up to o_s, oldest first; or features of them
     :param action: (N, A) float32, a_s
     :param reward: (N,) float32, R of `n_step_return`; 0 where rewards are unknown
     :param discount: (N,) float32, D of `n_step_return`, the weight of the value at `next_image`
@@ -92,6 +92,7 @@ def draw_transitions(
     rng: np.random.Generator,
     pad: int = 0,
     frames: int = 3,
+    seen: Sequence[np.ndarray] | None = None,
 ) -> Transitions:
     """Draws transitions whose n steps lie inside one episode, every start equally likely.
 
@@ -104,6 +105,7 @@ def draw_transitions(
     :param action_dim: A; narrower actions are padded with zeros
     :param pad: pixels by which `image` and `next_image` are shifted at most, independently
     :param frames: F, the images in a stack
+    :param seen: for each trajectory what stands for its images, (T + 1, ...), such as features
     :raises ValueError: there is no trajectory
     """
     if not trajectories:
@@ -112,7 +114,8 @@ def draw_transitions(
     drawn = rng.integers(starts[-1], size=size)
     chosen = np.searchsorted(starts, drawn, side="right")
     begin = drawn - np.concatenate([[0], starts])[chosen]
-    image = np.empty((2, size, frames, *trajectories[0].image.shape[1:]), np.uint8)
+    shown = [t.image for t in trajectories] if seen is None else seen
+    image = np.empty((2, size, frames, *shown[0].shape[1:]), shown[0].dtype)
     action = np.zeros((size, action_dim), np.float32)
     outcome = np.zeros((2, size), np.float32)
     before = np.arange(1 - frames, 1)
@@ -120,7 +123,7 @@ def draw_transitions(
         trajectory = trajectories[i]
         end = min(s + n_steps, len(trajectory))
         for side, time in enumerate((s, end)):
-            image[side, row] = trajectory.image[np.maximum(time + before, 0)]
+            image[side, row] = shown[i][np.maximum(time + before, 0)]
         action[row, : trajectory.action_dim] = trajectory.action[s, : trajectory.action_dim]
         reward = np.zeros(end - s) if trajectory.reward is None else trajectory.reward[s:end]
         terminated = trajectory.terminated and end == len(trajectory)

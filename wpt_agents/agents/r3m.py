@@ -1,0 +1,247 @@
+"""R3M (Nair et al., 2022): a frozen encoder that was pre-trained by time-contrastive learning.
+
+Source: https://arxiv.org/abs/2203.12601. Its language loss is left out, since our data have no
+words. DrQ-v2's actor and critic learn on the frozen features, as in https://arxiv.org/abs/2212.05749.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from torch import Tensor, nn
+from torch.optim import Adam
+from tqdm.auto import tqdm
+
+from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
+from wpt_agents.agents.frame_agent import FrameProgress, descend
+from wpt_agents.data.convert import Data
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.files.model_file import read_model
+from wpt_agents.model.behavior_cloning import FRAMES
+from wpt_agents.model.frames import FrameEncoder
+from wpt_agents.model.resnet import ResNet, read_r3m
+from wpt_agents.model.time_contrastive import (
+    aligned,
+    derangements,
+    draw_clips,
+    r3m_loss,
+    random_crop,
+)
+from wpt_agents.training.keywords import Stage, choice, count
+from wpt_agents.training.randomness import Purpose
+
+BACKBONES = ("conv", "resnet18", "resnet34", "resnet50")
+NEGATIVES = 3  # other clips that each clip is contrasted with
+EVERY = 1_000  # pre-training updates between two model files
+
+
+class FrameFeatures(nn.Module):
+    """Features of single images, and of stacks of them: the encoder that is frozen downstream.
+
+    :param backbone: "conv", DrQ-v2's convolutions and a linear layer of 512, or a ResNet
+    :param channels: of the convolutions
+    """
+
+    def __init__(self, backbone: str, channels: int) -> None:
+        super().__init__()
+        if backbone == "conv":
+            body = FrameEncoder((channels,) * 4, (2, 1, 1, 1), frames=1, centre=0.5)
+            self.body: nn.Module = nn.Sequential(body, nn.Linear(body.embed_dim, 512))
+            self.width = 512
+        else:
+            self.body = ResNet(int(backbone.removeprefix("resnet")))
+            self.width = self.body.features
+        self.backbone = backbone
+        self.embed_dim = FRAMES * self.width
+
+    def features(self, image: Tensor) -> Tensor:
+        """(N, 64, 64, 3) -> (N, Z)."""
+        return self.body(image[:, None] if self.backbone == "conv" else image)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """(N, F, 64, 64, 3) uint8, or features (N, F, Z) of these images -> (N, F Z)."""
+        if frames.dtype == torch.uint8:
+            frames = self.features(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
+        return frames.flatten(1).float()
+
+
+class R3MPolicy(DrQv2Policy):
+    """DrQ-v2's actor and critic on a frozen encoder, which new tasks keep.
+
+    :param backbone: of `FrameFeatures`
+    """
+
+    def __init__(self, *args: Any, backbone: str = "conv", **kwargs: Any) -> None:
+        self.backbone = backbone
+        super().__init__(*args, **kwargs)
+
+    def make_encoder(self, channels: int) -> Any:
+        """Keep the encoder, or draw it if there is none yet."""
+        if hasattr(self, "encoder"):
+            return self.encoder
+        return FrameFeatures(self.backbone, channels).requires_grad_(False)
+
+
+class R3MLearner(DrQv2Learner):
+    """The update of DrQ-v2 on frozen features, and the pre-training of the encoder."""
+
+    policy: R3MPolicy
+
+    def __init__(self, policy: R3MPolicy, given: "R3MKeywords") -> None:
+        super().__init__(policy, given)
+        self.encoder_optimizer = Adam(policy.encoder.parameters(), given.learning_rate, fused=True)
+
+    def pretrain(self, clips: Tensor, others: Tensor) -> dict[str, Tensor]:
+        """One update of the encoder by `r3m_loss`.
+
+        :param clips: (B, 3, 64, 64, 3), cropped
+        :param others: (K, B)
+        """
+        encoder = self.policy.encoder.requires_grad_(True)
+        z = encoder.features(clips.flatten(0, 1)).unflatten(0, clips.shape[:2])
+        loss = r3m_loss(z, others)
+        descend(self.encoder_optimizer, loss, "R3M")
+        encoder.requires_grad_(False)
+        return {"pretrain/r3m_loss": loss.detach(), "pretrain/aligned": aligned(z.detach())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class R3MKeywords(DrQv2Keywords):
+    """The keywords of `R3M`; pre-training's are those of its published code."""
+
+    backbone: str = choice("conv", BACKBONES, "the encoder of single images", Stage.SIZE)
+    clips: int = count(16, "clips in a batch of pre-training", Stage.PRETRAINING, least=2)
+
+
+@dataclass(kw_only=True)
+class R3MProgress(FrameProgress):
+    """How far an agent has come, its pre-training included."""
+
+    pretrain_steps: int = 0
+
+
+class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
+    """DrQ-v2 on frozen features that were pre-trained by time-contrastive learning.
+
+    Example::
+
+        model = R3M.pretrain("data/dmc", steps=20_000)
+        model.set_env("wpt/dmc-walker-run-v0")
+        model.learn(75_000)
+
+    `model.load_weights("r3m_18.pt")` of an agent with `backbone="resnet18"` takes the network that
+    R3M's authors publish. There is no augmentation, so each image is encoded once, and its features
+    are kept beside the episode.
+
+    :param policy: "CnnPolicy"
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": R3MPolicy}
+    saved_as = "R3M"
+    policy: R3MPolicy
+    learner: R3MLearner
+    hyperparameters: R3MKeywords
+    progress: R3MProgress
+    shape_keywords = (*DrQv2.shape_keywords, "backbone")
+    _features: list[np.ndarray]  # of each episode of `_features_of`
+    _features_of: ReplayBuffer | None = None
+
+    def make_policy(self) -> R3MPolicy:
+        """Make the networks, as wide as the environment's actions."""
+        given = self.hyperparameters
+        widths = given.channels, given.feature_dim, given.hidden_dim
+        own = self.observation_space, self.action_space, None
+        return R3MPolicy(*own, *widths, backbone=given.backbone)
+
+    def make_learner(self) -> R3MLearner:
+        """Make the optimisers."""
+        return R3MLearner(self.policy, self.hyperparameters)
+
+    def load_weights(self, path: str | os.PathLike[str]) -> None:
+        """Take the network of a file that R3M's authors publish.
+
+        :raises ValueError: another layout, or another depth than `backbone` has
+        """
+        body, weights = self.policy.encoder.body, read_r3m(os.fspath(path))
+        if not isinstance(body, ResNet) or body.state_dict().keys() != weights.keys():
+            raise ValueError(
+                f"{os.fspath(path)} does not fit backbone={self.hyperparameters.backbone!r}: make "
+                "the agent with backbone='resnet18', 'resnet34' or 'resnet50', as the file's name"
+            )
+        body.load_state_dict(weights)
+        self._features_of = None
+
+    def seen(self, replay: ReplayBuffer) -> list[np.ndarray]:
+        """Return the features of each episode, float16, which are computed once."""
+        if self._features_of is not replay:
+            self._features = []
+            self._features_of = replay
+        for trajectory in replay.trajectories[len(self._features) :]:
+            self._features.append(self._encode(trajectory.image))
+        return self._features
+
+    @torch.no_grad()
+    def _encode(self, image: np.ndarray) -> np.ndarray:
+        parts = torch.from_numpy(image).split(64)
+        encoded = [self.policy.encoder.features(part.to(self.device)).half() for part in parts]
+        return torch.cat(encoded).cpu().numpy()
+
+    @classmethod
+    def pretrain(
+        cls,
+        dataset: Data,
+        env: GymEnv | str | None = None,
+        steps: int = 20_000,
+        run_dir: str | os.PathLike[str] | None = None,
+        seed: int | None = None,
+        progress_bar: bool = False,
+        callback: Callable[[int, dict[str, float]], Any] | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Train the encoder on reward-free trajectories of any robots.
+
+        :param dataset: whatever `open_dataset` takes
+        :param env: the environment to continue with, if known
+        :param steps: updates
+        :param run_dir: folder of `model.zip`, which is written every 1,000 updates and at the end;
+            if it is there already, training continues from it
+        :param callback: called after every update with (step, metrics)
+        :param kwargs: keywords of `R3M`
+        """
+        cls.check_keywords(kwargs)
+        model = cls(seed=seed, **kwargs)
+        model.set_dataset(dataset)
+        path = Path(run_dir) / "model.zip" if run_dir is not None else None
+        if path is not None and path.exists():
+            model.restore(*read_model(path), (*cls.shape_keywords, "clips"))
+        model._pretrain(steps, path, progress_bar, callback)
+        if env is not None:
+            model.set_env(env)
+        return model
+
+    def _pretrain(
+        self,
+        steps: int,
+        path: Path | None,
+        progress_bar: bool,
+        callback: Callable[[int, dict[str, float]], Any] | None,
+    ) -> None:
+        assert self.dataset is not None
+        trajectories = list(self.dataset)
+        done = self.progress.pretrain_steps
+        for step in tqdm(range(done, steps), desc="pre-train", disable=not progress_bar):
+            rng = self.streams.numpy(Purpose.PRETRAIN, step)
+            clips = draw_clips(trajectories, self.hyperparameters.clips, rng)
+            others = derangements(len(clips), NEGATIVES, rng).to(self.device)
+            metrics = self.learner.pretrain(random_crop(clips, rng).to(self.device), others)
+            self.progress.pretrain_steps = step + 1
+            if callback is not None:
+                callback(step + 1, {name: float(value) for name, value in metrics.items()})
+            if path is not None and ((step + 1) % EVERY == 0 or step + 1 == steps):
+                self.save(path)

@@ -13,6 +13,7 @@ from wpt_agents.model.actor_critic import (
     actor_loss,
     critic_loss,
     discounts,
+    draw_starts,
     ema_update,
     lambda_return,
     return_range,
@@ -110,6 +111,35 @@ def test_the_actor_is_not_judged_by_what_its_actions_did_not_cause():
     # the reward of the start, and the entropy of the action whose outcome lies past the horizon
     assert not returns.grad[:, 0].any() and returns.grad[:, 1:].all()
     assert not entropy.grad[:, -1].any() and entropy.grad[:, :-1].all()
+
+
+def starts(*arguments, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return draw_starts(*arguments, generator, torch.device("cpu"))
+
+
+def test_without_a_number_dreams_start_from_every_state():
+    assert starts(3, 5, 0).tolist() == list(range(15))
+
+
+def test_dreams_start_from_states_with_three_images_and_from_every_row_alike():
+    drawn = starts(4, 6, 10)  # 10 of 4 x 4
+    assert len(set(drawn.tolist())) == 10
+    assert (drawn % 6 >= 2).all()
+    # 10 states in 4 rows: 10 k // 4 is 0, 2, 5, 7, 10 for k = 0 .. 4
+    assert torch.bincount(drawn // 6).tolist() == [2, 3, 2, 3]
+
+
+def test_more_starts_than_there_are_become_all_that_have_seen_three_images():
+    assert starts(2, 4, 100).tolist() == [2, 3, 6, 7]
+    assert starts(2, 2, 100).tolist() == [0, 1, 2, 3]  # no state has: all of them
+
+
+def test_each_state_is_drawn_equally_often_and_by_the_generator_alone():
+    assert starts(2, 6, 4).tolist() == starts(2, 6, 4).tolist()
+    counts = sum(torch.bincount(starts(2, 6, 4, seed=s), minlength=12) for s in range(400))
+    expected = 400 * 4 / 8  # of 8 states with three images; sd of a count is 10
+    assert ((counts.view(2, 6)[:, 2:] - expected).abs() < 50).all()
 
 
 def test_the_return_scale_divides_returns_and_not_the_entropy():
@@ -293,16 +323,47 @@ def test_the_default_decay_is_a_millionth():
 
 def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
     model, metrics = filled(return_norm=True), defaultdict(list)
-    # from 1 to a range of 90: 1 + .01 * 89 = 1.89, then 1.89 + .01 * 88.11 = 2.7711;
-    # to a range of 0, of 2.7711: 2.7711 * .99 ** 200 = 0.37, which counts as 1
-    for width, times, scale in ((90.0, 1, 1.89), (90.0, 1, 2.7711), (0.0, 200, 1.0)):
+    # the first range, 3, counts in full; to 90: 3 + .01 * 87 = 3.87;
+    # to a range of 0, of 3.87: 3.87 * .99 ** 200 = 0.52, which counts as 1
+    for width, times, scale in ((3.0, 1, 3.0), (90.0, 1, 3.87), (0.0, 200, 1.0)):
         monkeypatch.setattr(
             "wpt_agents.training.updates.return_range", lambda _, w=width: torch.tensor(w)
         )
         model.policy.return_scale.mul_(0.99 ** (times - 1))
         model.update(metrics)
         assert metrics["train/return_scale"][-1].item() == pytest.approx(scale)
-    assert model.policy.return_scale.item() == pytest.approx(2.7711 * 0.99**200)
+    assert model.policy.return_scale.item() == pytest.approx(3.87 * 0.99**200)
+
+
+# ------------------------------------------------------------------------------- head start
+
+
+def test_in_the_head_start_the_actor_imitates_and_reads_no_dream(monkeypatch):
+    model = filled(actor_delay=1, kickstart=0.0)
+    model.cloned = True
+    before = [p.detach().clone() for p in model.policy.actor.parameters()]
+    critic = [p.detach().clone() for p in model.policy.critic.parameters()]
+    advice = torch.full((model.max_action_dim,), 0.5)
+    act = "wpt_agents.model.behavior_cloning.PriorActor.act"
+    monkeypatch.setattr(act, lambda self, image, mask: advice.expand(len(image), -1) * mask)
+    metrics = defaultdict(list)
+    model.update(metrics)
+    assert metrics["train/kickstart_loss"][0] > 0
+    assert not all(map(torch.equal, before, model.policy.actor.parameters()))
+    assert not all(map(torch.equal, critic, model.policy.critic.parameters()))
+    model.update(metrics)  # the head start is over: no imitation any more
+    assert len(metrics["train/kickstart_loss"]) == 1
+
+
+def test_without_a_prior_actor_the_actor_rests_during_the_head_start():
+    model = filled(actor_delay=2)
+    actor = [p.detach().clone() for p in model.policy.actor.parameters()]
+    critic = [p.detach().clone() for p in model.policy.critic.parameters()]
+    for moved in (False, False, True):
+        model.update(defaultdict(list))
+        same = all(map(torch.equal, actor, model.policy.actor.parameters()))
+        assert same is not moved
+    assert not all(map(torch.equal, critic, model.policy.critic.parameters()))
 
 
 # ------------------------------------------------------------------------------- randomness

@@ -205,3 +205,28 @@ def test_the_same_generator_gives_the_same_latents(rssm):
 def test_feat_is_deter_then_stoch():
     state = some_state()
     assert torch.equal(state.feat, torch.cat([state.deter, state.stoch.view(B, 64)], -1))
+
+
+def test_standardising_equals_a_posterior_that_sees_standardised_embeddings(rssm):
+    embed = 3 + noise(64, E) * torch.linspace(0.5, 4, E)
+    embed[:, -1] = 7.0  # an entry that never varies is only shifted
+    h = noise(64, D)
+    std, mean = torch.std_mean(embed, 0)
+    seen = (embed - mean) / std.clamp_min(0.01)
+    *before, last = rssm.post_out
+    x = torch.cat([h, seen], -1) @ rssm.post_in.weight.T + rssm.post_in.bias
+    for layer in before:
+        x = layer(x)
+    logits = x @ (4 * last.weight).T + last.bias
+    expected = rssm._log_probs(logits)
+    rssm.standardise(embed)
+    torch.testing.assert_close(rssm.posterior(h, embed), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_standardising_lets_images_change_the_initial_posterior(rssm):
+    embed = 3 + 0.1 * noise(64, E)  # most of it is the same for every image
+    h = torch.zeros(64, D)
+    before = rssm.posterior(h, embed).exp().std(0).mean()
+    rssm.standardise(embed)
+    after = rssm.posterior(h, embed).exp().std(0).mean()
+    assert after > 4 * before

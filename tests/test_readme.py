@@ -87,7 +87,7 @@ def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
     settings = {name: value for name, value in SETTINGS.items() if name != "seed"}
     exec(code, left := {"SETTINGS": settings})
     assert re.search(r"return \d+", capsys.readouterr().out)
-    assert left["model"].updates == (75 - 10) * 0.5 // (2 * 4)  # train_ratio / (B x T)
+    assert left["model"].updates == 75 * 0.5 // (2 * 4)  # train_ratio / (B x T)
     assert len(left["model"].retrieved_ids) == 3 and (tmp_path / "drawer.zip").exists()
 
 

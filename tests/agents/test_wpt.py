@@ -363,8 +363,39 @@ def test_num_timesteps_counts_every_call_of_step():
 
 def test_updates_follow_the_train_ratio():
     model = agent(ClockEnv(), learning_starts=14, train_ratio=4).learn(42)
-    # 42 - 14 steps, each replayed 4 times, 2 x 4 in an update
-    assert model.updates == 28 * 4 // 8
+    # 42 steps, those before learning starts too, each replayed 4 times, 2 x 4 in an update
+    assert model.updates == 42 * 4 // 8
+
+
+def test_no_update_is_made_before_learning_starts_and_then_all_that_were_earned():
+    model = agent(ClockEnv(length=7), learning_starts=14, train_ratio=4)
+    model.learn(7)
+    assert model.updates == 0
+    model.learn(7, reset_num_timesteps=False)
+    assert model.updates == 14 * 4 // 8
+
+
+def test_the_head_start_is_made_at_once_and_what_was_earned_counts_towards_it():
+    model = agent(ClockEnv(length=7), learning_starts=14, train_ratio=4, actor_delay=10)
+    model.learn(14)  # has earned 7 updates
+    assert model.updates == 10
+    model.learn(7, reset_num_timesteps=False)  # 7 * 4 / 8 = 3.5 more
+    assert model.updates == 13
+
+
+def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):
+    rates = []
+    model = pretrained(store, env=DotEnv(), guidance=1, bc_steps=4, bc_learning_rate=0.1)
+    descend = model._descend
+
+    def note_rate(optimizer, loss, name):
+        if name == "bc":
+            rates.append(optimizer.param_groups[0]["lr"])
+        return descend(optimizer, loss, name)
+
+    monkeypatch.setattr(model, "_descend", note_rate)
+    model.learn(1)
+    assert rates == pytest.approx([0.1, 0.075, 0.05, 0.025])
 
 
 def test_learning_in_two_calls_equals_one():
@@ -586,7 +617,7 @@ def test_another_task_starts_from_returns_of_no_known_scale():
     model = agent(DotEnv())
     model.policy.return_scale.fill_(1000)
     model.reset_task()
-    assert model.policy.return_scale == 1
+    assert model.policy.return_scale == 0
 
 
 def test_guidance_that_begins_later_has_a_clone_too(store):

@@ -43,6 +43,7 @@ class Method:
     :param shared: keywords of the preset's section `wpt` that the agent takes under the same name;
         None for all, as WPT does
     :param policy: the first argument of the agent
+    :param plus: whether the preset's section `plus` applies: what we add to the paper's algorithm
     :param wrap: what the agent puts around its environments, e.g. a stack of frames
     """
 
@@ -53,6 +54,7 @@ class Method:
     shared: tuple[str, ...] | None = None
     policy: str = "WPTPolicy"
     wrap: Callable[[VecEnv], VecEnv] | None = None
+    plus: bool = False
 
     @property
     def section(self) -> str:
@@ -82,8 +84,10 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
 ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
 METHODS = {
     "wpt": Method(),
+    "wpt+": Method(plus=True),
     "kickstart": Method(keywords={"kickstart": 20.0}),
-    "scratch": Method(keywords=ALONE, pretrained=False, needs_data=False),
+    # Scratch has every addition that needs neither data nor a clone.
+    "scratch": Method(keywords=ALONE, pretrained=False, needs_data=False, plus=True),
     "pretrain-only": Method(keywords=ALONE),
     "no-guidance": Method(keywords={"guidance": 0.0, "kickstart": 0.0}),
     "no-rehearsal": Method(keywords={"offline_ratio": 0.0}),

@@ -100,6 +100,7 @@ class Preset:
     """Everything a run is to do, apart from task, method and seed.
 
     :param wpt: keyword arguments of WPT and nothing else
+    :param plus: those that the methods `wpt+` and `scratch` use besides: additions to the paper
     """
 
     env: EnvSettings = EnvSettings()
@@ -108,6 +109,7 @@ class Preset:
     learn: LearnSettings = LearnSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
     wpt: dict[str, Any] = field(default_factory=dict)
+    plus: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         counts = {
@@ -125,7 +127,7 @@ class Preset:
                 "learn.frames / env.action_repeat must be at least 1, got "
                 f"{self.learn.frames} / {self.env.action_repeat}."
             )
-        for key in self.wpt:
+        for key in {**self.wpt, **self.plus}:
             if key not in wpt_keywords():
                 raise unknown_name("WPT keyword", key, wpt_keywords())
 
@@ -138,8 +140,9 @@ class Preset:
                 raise unknown_name("section", title, types)
             if not isinstance(section, Mapping):
                 raise ValueError(f"Section {title!r} must hold keys and values, got {section!r}.")
-        sections = {t: types[t].of(t, s) for t, s in given.items() if t != "wpt"}
-        return cls(**sections, wpt=dict(given.get("wpt", {})))
+        keywords = {t: dict(given.get(t, {})) for t in ("wpt", "plus")}
+        sections = {t: types[t].of(t, s) for t, s in given.items() if t not in keywords}
+        return cls(**sections, **keywords)
 
     @property
     def steps(self) -> int:
@@ -149,6 +152,7 @@ class Preset:
     def as_dict(self) -> dict[str, Any]:
         """Plain dictionaries and lists, as `config.yaml` shows them."""
         given = asdict(self)
+        del given["plus"]  # a run's `wpt` holds what of it applies
         return given | {"collect": given["collect"] | {"tasks": list(self.collect.tasks)}}
 
 

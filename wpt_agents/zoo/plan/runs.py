@@ -92,7 +92,8 @@ class Run:
     @property
     def keywords(self) -> dict[str, Any]:
         """The keywords of the agent, the method's own included."""
-        return self.algorithm.settings(self.preset.wpt)
+        plus = self.preset.plus if self.algorithm.plus else {}
+        return self.algorithm.settings({**self.preset.wpt, **plus})
 
     @property
     def full_keywords(self) -> Mapping[str, Any]:

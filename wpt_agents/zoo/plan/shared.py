@@ -31,7 +31,7 @@ FINE_TUNING = {
         "guidance",
         "kickstart",
     ),
-    *("offline_ratio", "retrieval", "num_retrieve"),
+    *("offline_ratio", "retrieval", "num_retrieve", "imagine_starts", "actor_delay"),
     *("bc_steps", "bc_batch_size", "bc_learning_rate"),
 }
 

@@ -162,7 +162,7 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
     dream = model.policy.dream(Latent(*state), 4, generator())
     ensemble = model.policy.curiosity
     ensemble.scale.see(torch.tensor(1.0))
-    model.arrival = torch.arange(5.0)
+    model.arrival, model.starts = torch.arange(-1.0, 5.0), torch.arange(1, 6)
     reward = model._imagined_reward(dream)
     assert reward.shape == (5, 4) and (reward[:, 1:] > 0).all()
     assert reward[:, 0].tolist() == [0, 1, 2, 3, 4]
@@ -179,6 +179,7 @@ def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
     batch.is_first[0, 4] = True  # an episode's edge
     ensemble = copy.deepcopy(model.policy.curiosity)  # as it is before the update
     post = model._update_world_model(batch, defaultdict(list), generator())
+    model.starts = torch.arange(18)
     dream = model.policy.dream(post.flatten_time(), 2, generator())
     paid = model._imagined_reward(dream)[:, 0].view(2, 9)
     surprise = disagreement(ensemble(post.feat[:, :-1], batch.action[:, 1:]))

@@ -243,7 +243,9 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
     title, dot, key = key.strip().rpartition(".")
     if not dot and key not in wpt_keywords():
         sections = get_type_hints(Preset)
-        dotted = {f"{t}.{k}" for t, s in sections.items() if is_dataclass(s) for k in get_type_hints(s)}
+        dotted = {
+            f"{t}.{k}" for t, s in sections.items() if is_dataclass(s) for k in get_type_hints(s)
+        }
         raise unknown_name("key for --set", key, {*wpt_keywords(), *dotted})
     try:
         return {title or "wpt": {key: read_yaml(value)}}

@@ -142,7 +142,7 @@ class Preset:
                 raise ValueError(f"Section {title!r} must hold keys and values, got {section!r}.")
         keywords = {t: dict(given.get(t, {})) for t in ("wpt", "plus")}
         sections = {t: types[t].of(t, s) for t, s in given.items() if t not in keywords}
-        return cls(**sections, **keywords)
+        return cls(**sections, wpt=keywords["wpt"], plus=keywords["plus"])
 
     @property
     def steps(self) -> int:

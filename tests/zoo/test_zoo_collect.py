@@ -367,10 +367,10 @@ def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypat
     )
     with pytest.raises(StopIteration):
         call(monkeypatch, "collect", "--suite", "metaworld", "--out", tmp_path)
-    [((_, tasks, episodes, seed, _, behaviour, _), more)] = asked
-    assert (len(tasks), episodes, seed, behaviour) == (50, 1000, 0, "scripted")
+    [((_, tasks, number, seed, _, behaviour, _), more)] = asked
+    assert (len(tasks), number, seed, behaviour) == (50, 1000, 0, "scripted")
     plan = episodes.Recipe(sigmas=tuple(more["sigmas"]))
-    count = Counter(plan.sigma(episode) for episode in range(episodes))
+    count = Counter(plan.sigma(episode) for episode in range(number))
     assert count == {0.1: 200, 0.3: 200, 0.5: 200, 1.0: 200, 2.0: 200}
     assert not more["rewards"]
 

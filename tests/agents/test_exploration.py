@@ -26,8 +26,8 @@ from wpt_agents.agents.curious import (
 )
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import led_to, stack_windows
-from wpt_agents.model.networks import SIZES
 from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import SIZES
 
 QUICK = {k: v for k, v in SETTINGS.items() if k in {**EXPLORE, "imagine_horizon": 0, "device": 0}}
 QUICK |= {"offline_ratio": 0.0, "guidance": 0.0, "max_action_dim": 3, "device": "cpu"}

@@ -12,15 +12,15 @@ import pytest
 import torch
 from debug_agent import SETTINGS, agent, recorded, same, weights
 from gymnasium import spaces
-from torch import nn
 from toy_env import DotEnv
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.fast.acting import FastActor, FastStep
 from wpt_agents.files.official import PARTS
-from wpt_agents.model import networks
-from wpt_agents.model.networks import Size, to_unit
-from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.images import to_unit
+from wpt_agents.model.ops import definitions
+from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import Size
 from wpt_agents.model.world_model import squared_error
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -82,22 +82,8 @@ def assert_all_close(outputs, expected):
         torch.testing.assert_close(value.detach(), expected[name], rtol=0, atol=1e-5, msg=name)
 
 
-@pytest.fixture
-def by_definition(monkeypatch):
-    """Replaces what is computed faster than it reads by its definition."""
-
-    def plain(layer, x):
-        return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
-
-    for layer in (networks.UpConv, networks.ToPixels, networks.FromPixel):
-        monkeypatch.setattr(layer, "forward", plain)
-    monkeypatch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
-    monkeypatch.setattr(networks, "by_convolution", lambda *_: False)
-    monkeypatch.setattr(RSSM, "_scan", RSSM._filter)
-
-
-def test_the_definitions_compute_what_the_authors_code_computes(expected, by_definition):
-    with torch.no_grad():  # the scan by hand is for learning
+def test_the_definitions_compute_what_the_authors_code_computes(expected):
+    with definitions():
         assert_all_close(computed(tiny().policy, expected), expected)
 
 
@@ -123,9 +109,9 @@ def test_imagination_steps_as_the_authors_code(expected):
 @torch.no_grad()
 def test_the_fast_path_of_acting_computes_what_the_authors_code_computes(expected):
     policy, state = tiny().policy, Latent(expected["deter"], expected["stoch"])
-    step, first = policy._stepper(), torch.zeros(5, dtype=torch.bool)
-    assert isinstance(step, FastStep)
-    post, _ = step(expected["image"], state, expected["action"], first, sample=False)
+    first = torch.zeros(5, dtype=torch.bool)
+    step = FastStep(policy)
+    post, _ = step(expected["image"], state, expected["action"], first, None, sample=False)
     torch.testing.assert_close(post.deter, expected["next_deter"], rtol=0, atol=1e-5)
     assert torch.equal(post.stoch.argmax(-1), expected["post_log_probs"].argmax(-1))
     mean, std = FastActor(policy.actor, policy.size.classes)(state).chunk(2, -1)

@@ -18,7 +18,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files import archive, model_file
 from wpt_agents.files.model_file import read_model, write_model
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.sizes import SIZES
 
 
 @pytest.fixture

@@ -1,45 +1,22 @@
-"""What is computed faster than it reads is the same: losses and weights after whole updates."""
+"""Faster twins together: losses and weights after whole updates are those of the definitions."""
 
 from collections import defaultdict
 
 import pytest
 import torch
 from debug_agent import agent, pretrained, recorded, weights
-from torch import nn
 from torch._dynamo.backends.registry import lookup_backend
 
+from wpt_agents.fast import pieces, products
 from wpt_agents.fast.compiled import compile_loops
-from wpt_agents.model import networks
-from wpt_agents.model.rssm import RSSM, BlockGRU
-from wpt_agents.model.world_model import WorldModel, squared_error
-from wpt_agents.training import updates
-
-
-def plain(layer, x):
-    return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
-
-
-def error(model, latent, image):
-    return squared_error(networks.to_unit(image), model.decode(latent))
-
-
-def by_definition(patch):
-    patch.setattr(networks.UpConv, "forward", plain)
-    patch.setattr(networks.ToPixels, "forward", plain)
-    patch.setattr(networks.FromPixel, "forward", plain)
-    patch.setattr(WorldModel, "reconstruction_error", error)
-    patch.setattr(networks, "in_pieces", lambda layers, _, *inputs: layers(*inputs))
-    patch.setattr(networks, "by_convolution", lambda *_: False)
-    patch.setattr(updates, "over_steps", lambda head, states: head(states.feat))
-    patch.setattr(RSSM, "_scan", RSSM._filter)
-    forward = BlockGRU.forward
-    patch.setattr(BlockGRU, "forward", lambda self, h, z, a, shared=None: forward(self, h, z, a))
+from wpt_agents.model.ops import definitions
+from wpt_agents.model.rssm import filter_sequence
 
 
 def as_of_many_rows(patch):
-    patch.setattr(networks, "MANY", 16)
-    patch.setattr(networks, "WORK", 0)
-    patch.setattr(networks, "AMD_AVX512", True)  # whether or not it is
+    patch.setattr(products, "MANY", 16)
+    patch.setattr(products, "WORK", 0)
+    patch.setattr(products, "AMD_AVX512", True)  # whether or not it is
 
 
 def three_updates(backend=None):
@@ -63,16 +40,18 @@ def seen(function, calls):
 
 
 def test_three_updates_are_those_of_the_definition(monkeypatch):
-    monkeypatch.setattr(networks, "PIECE", 5 * 32 * 32 * 12)  # several pieces, one incomplete
-    monkeypatch.setattr(updates, "PIECE", 1)  # the heads see the dreams step by step
+    # images one at a time, embeddings in pieces of 3 and 2, the heads' states step by step
+    monkeypatch.setattr(pieces, "PIECE", 32 * 32 * 12)
     as_of_many_rows(monkeypatch)
     taken = []
-    monkeypatch.setattr(networks, "convolved", seen(networks.convolved, taken))
+    by_convolution = seen(products.product_by_convolution, taken)
+    monkeypatch.setattr(products, "product_by_convolution", by_convolution)
     fast, after = three_updates()
     assert taken
-    with monkeypatch.context() as patch:
-        by_definition(patch)
+    taken.clear()
+    with definitions():
         slow, expected = three_updates()
+    assert not taken
     for name, values in fast.items():
         torch.testing.assert_close(values, slow[name], rtol=1e-4, atol=1e-5, msg=name)
     for name, weight in after.items():
@@ -84,7 +63,7 @@ def test_three_updates_are_those_of_the_definition(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # at which torch looks
 def test_three_compiled_updates_are_those_of_the_definition(monkeypatch):
-    monkeypatch.setattr(RSSM, "_scan", RSSM._filter)  # the way of a GPU
+    monkeypatch.setattr(filter_sequence, "twins", [])  # as on a GPU
     as_of_many_rows(monkeypatch)  # what can be compiled of a CPU's way
     expected, after = three_updates()
     graphs = []

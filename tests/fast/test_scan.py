@@ -3,8 +3,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wpt_agents.model.networks import SIZES
-from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.fast.scan import scan
+from wpt_agents.model.ops import definitions
+from wpt_agents.model.rssm import RSSM, Latent, filter_sequence
+from wpt_agents.model.sizes import SIZES
 
 A, E, B, T = 3, 10, 4, 7
 SIZE = SIZES["debug"]
@@ -31,10 +33,10 @@ def ways(unimix, size=SIZE):
 
 
 def outcome(way, rssm, leaves, is_first):
-    """The outputs of `_filter` or `_scan`, and twice the gradients of a sum weighing each entry."""
+    """The outputs of a way, and twice the gradients of a weighted sum of them."""
     embed_half, action_embed, deter, stoch = leaves
     generator = torch.Generator().manual_seed(5)
-    post, logits = way(embed_half, action_embed, is_first, Latent(deter, stoch), generator)
+    post, logits = way(rssm, embed_half, action_embed, is_first, Latent(deter, stoch), generator)
     outputs = [post.deter, post.stoch, logits]
     total = sum((x * noise(*x.shape, seed=9)).sum() for x in outputs)
     layers = rssm.gru.from_action, rssm.prior_net  # outside the scan
@@ -54,8 +56,8 @@ def outcome(way, rssm, leaves, is_first):
 )
 def test_the_scan_by_hand_is_the_loop_with_its_gradients(unimix, size):
     rssm, leaves, is_first = ways(unimix, size)
-    plain, plain_gradients, _ = outcome(rssm._filter, rssm, leaves, is_first)
-    fast, gradients, again = outcome(rssm._scan, rssm, leaves, is_first)
+    plain, plain_gradients, _ = outcome(filter_sequence.definition, rssm, leaves, is_first)
+    fast, gradients, again = outcome(scan, rssm, leaves, is_first)
     assert torch.equal(fast[1].argmax(-1), plain[1].argmax(-1))  # the same draws
     torch.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(gradients, plain_gradients, rtol=1e-4, atol=1e-5)
@@ -63,14 +65,19 @@ def test_the_scan_by_hand_is_the_loop_with_its_gradients(unimix, size):
     assert all(g.any() for g in gradients.values())
 
 
-def test_observe_takes_the_scan_when_it_learns_on_a_cpu(monkeypatch):
+def test_observe_takes_the_scan_when_it_learns_on_a_cpu():
     rssm, _, is_first = ways(0.01)
-    monkeypatch.setattr(rssm, "_scan", lambda *_: pytest.fail("scanned"))
     arguments = noise(B, T, E), noise(B, T, A), is_first
+
+    def node(sample=True):
+        return type(rssm.observe(*arguments, sample=sample)[0].deter.grad_fn.next_functions[0][0])
+
+    assert node().__name__ == "FilterScanBackward"
+    assert node(sample=False).__name__ != "FilterScanBackward"
     with torch.no_grad():
-        rssm.observe(*arguments)
-    with pytest.raises(pytest.fail.Exception, match="scanned"):
-        rssm.observe(*arguments)
+        assert rssm.observe(*arguments)[0].deter.grad_fn is None
+    with definitions():
+        assert node().__name__ != "FilterScanBackward"
 
 
 def test_in_bfloat16_the_scan_stays_in_float32():
@@ -80,12 +87,12 @@ def test_in_bfloat16_the_scan_stays_in_float32():
         post, logits, prior_logits = rssm.observe(
             embed, action, is_first, generator=torch.Generator().manual_seed(5)
         )
-        embed_half = rssm._embed_half(embed).float()
+        embed_half = rssm.embed_half(embed).float()
         keep = (~is_first[..., None]).float()
         action_embed = rssm.gru.from_action(action * keep).float()
-    expected, expected_logits = rssm._filter(
-        embed_half, action_embed, is_first, rssm.initial(B), torch.Generator().manual_seed(5)
-    )
+    inputs = embed_half, action_embed, is_first, rssm.initial(B)
+    with definitions():
+        expected, expected_logits = filter_sequence(rssm, *inputs, torch.Generator().manual_seed(5))
     assert post.deter.dtype == logits.dtype == torch.float32
     torch.testing.assert_close((post, logits), (expected, expected_logits), rtol=1e-4, atol=1e-5)
     (post.deter.sum() + prior_logits.sum()).backward()

@@ -7,6 +7,7 @@ import torch
 from chain import chain
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.fast import pieces
 from wpt_agents.model.actor_critic import (
     Actor,
     Critic,
@@ -18,10 +19,10 @@ from wpt_agents.model.actor_critic import (
     lambda_return,
     return_range,
 )
-from wpt_agents.model.networks import SIZES, frozen
+from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import IMAGE_SPACE, WPTPolicy
-from wpt_agents.model.rssm import Latent
-from wpt_agents.training import updates
+from wpt_agents.model.rssm import Latent, over_steps
+from wpt_agents.model.sizes import SIZES
 
 DEBUG, WIDTH, H = SIZES["debug"], 5, 4
 OWN = torch.tensor([True, True, False, False, False])
@@ -400,10 +401,10 @@ def test_a_head_sees_the_steps_of_a_dream_alike_at_once_and_one_by_one(monkeypat
         return net(feat)
 
     def outcome():
-        out = updates.over_steps(head, states)
+        out = over_steps(head, states)
         return out, torch.autograd.grad(out, [*states, net.weight], noise(4, 3, 2, seed=2))
 
     at_once = outcome()
-    monkeypatch.setattr(updates, "PIECE", 4 * 3 * 9 - 1)  # one less than there are
+    monkeypatch.setattr(pieces, "PIECE", 4 * 3 * 9 - 1)  # one less than there are
     torch.testing.assert_close(outcome(), at_once)
     assert seen == [(4, 3, 9), *3 * [(4, 9)]]

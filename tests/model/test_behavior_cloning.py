@@ -11,7 +11,7 @@ from wpt_agents.model.behavior_cloning import (
     random_shift,
     recent_frames,
 )
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.sizes import SIZES
 
 OWN = torch.tensor([True, True, False])
 

@@ -3,8 +3,8 @@ import torch
 import torch.nn.functional as F
 
 from wpt_agents.model.distributions import mode_one_hot
-from wpt_agents.model.networks import SIZES
-from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.rssm import RSSM, Latent, filter_step
+from wpt_agents.model.sizes import SIZES
 
 DEBUG, A, E = SIZES["debug"], 3, 10
 B, T, D = 2, 6, DEBUG.deter
@@ -77,12 +77,10 @@ def slow_posterior(rssm, h, e):
 def test_the_gru_is_the_slow_reference(rssm):
     state, action = some_state(), noise(B, A)
     with torch.no_grad():
-        plain = rssm.step(state, action)
-        shared = rssm.step(state, action, rssm.gru.shared_weight())
+        step = rssm.step(state, action)
         for b in range(B):
             slow = slow_gru(rssm.gru, state.deter[b], state.stoch[b], action[b])
-            torch.testing.assert_close(plain[b], slow)
-            torch.testing.assert_close(shared[b], slow)
+            torch.testing.assert_close(step[b], slow)
 
 
 def test_a_units_gates_stand_in_its_own_block(rssm):
@@ -179,13 +177,17 @@ def test_a_sequence_may_be_filtered_in_pieces(rssm):
 @pytest.mark.parametrize("sample", [True, False])
 def test_a_filter_step_is_a_sequence_of_one_image(rssm, sample):
     embed, action, is_first = noise(B, 1, E), noise(B, 1, A, seed=1), first((1, 0))[:, :1]
+    keep = (~is_first).float()
     with torch.no_grad():
         whole, *_ = rssm.observe(
             embed, action, is_first, some_state(), torch.Generator().manual_seed(5), sample
         )
-        step = rssm.filter_step(
+        step, _ = filter_step(
+            rssm,
             some_state(),
-            *(x[:, 0] for x in (action, embed, is_first)),
+            rssm.gru.from_action(action[:, 0] * keep),
+            rssm.embed_half(embed[:, 0]),
+            is_first[:, 0],
             torch.Generator().manual_seed(5),
             sample,
         )

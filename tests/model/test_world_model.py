@@ -11,8 +11,9 @@ from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actor_critic import Actor, Critic
 from wpt_agents.model.behavior_cloning import PriorActor
 from wpt_agents.model.distributions import symexp
-from wpt_agents.model.networks import SIZES, to_unit
+from wpt_agents.model.images import to_unit
 from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import SIZES
 from wpt_agents.model.world_model import (
     WorldModel,
     reward_loss,
@@ -96,9 +97,7 @@ def test_the_reconstruction_error_in_pieces_is_that_of_all_images(monkeypatch):
     post, _, _ = model.observe(batch, seeded())
     expected = squared_error(to_unit(batch.image), model.decode(post))
     assert expected.shape == batch.image.shape[:2]
-    monkeypatch.setattr(
-        "wpt_agents.model.networks.PIECE", 2 * model.decoder.largest
-    )  # 2 + 2 + 2 + 1
+    monkeypatch.setattr("wpt_agents.fast.pieces.PIECE", 2 * model.decoder.row_size)  # 2 + 2 + 2 + 1
     torch.testing.assert_close(model.reconstruction_error(post, batch.image), expected)
 
 

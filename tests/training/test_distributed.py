@@ -16,9 +16,9 @@ from two_processes import together, train
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_model
-from wpt_agents.model.distributions import Share, exponential
+from wpt_agents.model.distributions import Share, exponential, kl_one_hot
 from wpt_agents.model.world_model import world_model_loss
-from wpt_agents.training.distributed import World
+from wpt_agents.training.distributed import World, part_free_nats
 from wpt_agents.zoo.commands import app as command_line
 
 JOBS = {
@@ -110,17 +110,17 @@ def test_shares_clip_the_kl_where_the_whole_batch_does(free_nats):
     post = torch.tensor([[0.8, 0.2], [0.95, 0.05]]).log().view(2, 1, 1, 2).requires_grad_()
     prior = torch.full((2, 1, 1, 2), 0.5).log().requires_grad_()
 
-    def gradients(rows, whole=None):
-        loss = world_model_loss(
-            error[rows], post[rows], prior[rows], free_nats=free_nats, whole=whole
-        )
+    def gradients(rows, free_nats=free_nats):
+        loss = world_model_loss(error[rows], post[rows], prior[rows], free_nats=free_nats)
         return loss.total.item(), torch.autograd.grad(loss.total, (post, prior))
 
     total, expected = gradients(slice(None))
-    kl = (0.8 * np.log(1.6) + 0.2 * np.log(0.4) + 0.95 * np.log(1.9) + 0.05 * np.log(0.1)) / 2
-    shares = [gradients(slice(i, i + 1), lambda _: torch.tensor(kl).float()) for i in (0, 1)]
-    for share_total, _ in shares:
-        assert share_total == pytest.approx(total, rel=1e-5)
+    kls = kl_one_hot(post, prior).detach()
+    shares = [
+        gradients(slice(i, i + 1), part_free_nats(free_nats, kls[i].mean(), kls.mean()))
+        for i in (0, 1)
+    ]
+    assert (shares[0][0] + shares[1][0]) / 2 == pytest.approx(total, rel=1e-5)
     for i, gradient in enumerate(expected):
         assert ((shares[0][1][i] + shares[1][1][i]) / 2).allclose(gradient, atol=1e-6)
 

@@ -16,7 +16,7 @@ from wpt_agents.agents import wpt
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.sizes import SIZES
 from wpt_agents.training import checks, pretraining, updates
 from wpt_agents.zoo.plan.runs import make_plan
 

@@ -1,6 +1,7 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 import torch
 from rich.console import Console, ConsoleDimensions
@@ -8,8 +9,12 @@ from torch import nn
 from typer.testing import CliRunner
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.model import networks
-from wpt_agents.model.networks import BlockLinear, FromPixel, ToPixels, UpConv
+from wpt_agents.fast import products
+from wpt_agents.model.images import Decoder
+from wpt_agents.model.layers import BlockLinear, UpConv
+from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import SIZES
+from wpt_agents.model.world_model import reconstruction_error
 from wpt_agents.zoo.bench import model as bench_model
 from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
 from wpt_agents.zoo.commands.app import app
@@ -51,28 +56,30 @@ def test_several_threads_take_turns_with_one():
 
 
 def test_a_product_by_convolution_counts_as_the_product(monkeypatch):
-    monkeypatch.setattr(networks, "AMD_AVX512", True)
-    monkeypatch.setattr(networks, "WORK", 0)
-    layer, x = BlockLinear(32, 64, 4), torch.ones(networks.MANY, 32)
-    assert networks.by_convolution(x, 16)
-    work = 2 * 2 * networks.MANY * 32 * 64 / 4  # backward for the weights alone
+    monkeypatch.setattr(products, "AMD_AVX512", True)
+    monkeypatch.setattr(products, "WORK", 0)
+    layer, x = BlockLinear(32, 64, 4), torch.ones(products.MANY, 32)
+    assert products.faster_by_convolution(x, 16)
+    work = 2 * 2 * products.MANY * 32 * 64 / 4  # backward for the weights alone
     assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(work / 1e9)
-    assert networks.by_convolution(x, 16)  # it is back
 
 
 def test_work_is_counted_as_the_layers_are_defined():
-    fast = UpConv.forward, UpConv.parities, FromPixel.forward
     # 3 x 5 by 5 x 7 is 2 * 105; backward the same twice, once without a gradient of the input
     layer, x = nn.Linear(5, 7), torch.ones(3, 5)
     assert timing.gflop(lambda: layer(x).sum().backward()) == pytest.approx(2 * 2 * 105 / 1e9)
     up, pixels = UpConv(4, 2, 6), torch.ones(3, 4, 5, 5)  # each of 5 x 5 pixels meets 6 x 6 weights
     work = 2 * 3 * 25 * 4 * 2 * 36
     assert timing.gflop(lambda: up(pixels)) == pytest.approx(work / 1e9)
-    one, pixel = FromPixel(4, 2, 5), torch.ones(3, 4, 1, 1)
+    one, pixel = UpConv(4, 2, 5), torch.ones(3, 4, 1, 1)
     assert timing.gflop(lambda: one(pixel)) == pytest.approx(2 * 3 * 4 * 2 * 25 / 1e9)
-    last = ToPixels(4, 2, 6)
-    assert timing.gflop(lambda: last.parities(pixels)) == pytest.approx(work / 1e9)
-    assert fast == (UpConv.forward, UpConv.parities, FromPixel.forward)  # they are back
+
+
+def test_the_reconstruction_error_counts_as_the_decoder():
+    decoder, image = Decoder(SIZES["debug"]), torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
+    state = Latent(torch.ones(2, 64), torch.ones(2, 8, 8))
+    decoding = timing.gflop(lambda: decoder(*state))
+    assert timing.gflop(lambda: reconstruction_error(decoder, state, image)) == decoding > 0
 
 
 def test_the_median_leaves_the_warm_up_out():
@@ -162,10 +169,17 @@ def test_a_table_shortens_nothing(monkeypatch, capsys):
 
 
 def test_acting_by_definition_is_measured_by_the_definition():
-    agent = WPT(size="debug", max_action_dim=2, seed=0)
-    quick, seen = agent.policy._stepper(), []
-    policy.defined(agent.policy, lambda: seen.append(agent.policy._stepper()))
-    assert seen == [agent.policy.step] and agent.policy._stepper() is quick
+    agent, seen = WPT(size="debug", max_action_dim=2, seed=0), []
+
+    def act():
+        state, image = agent.policy.initial_state(1), np.zeros((1, 64, 64, 3), np.uint8)
+        seen.append(work.launches(lambda: agent.policy.act(image, state, None)))
+
+    act()  # which makes what is kept for the next steps
+    act()
+    policy.by_definition(act)
+    act()
+    assert seen[1] == seen[3] < seen[2]
 
 
 def test_calls_are_of_operators_that_compute():

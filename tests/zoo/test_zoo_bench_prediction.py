@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.networks import to_unit
+from wpt_agents.model.images import to_unit
 from wpt_agents.model.world_model import squared_error
 from wpt_agents.zoo.bench import prediction as bench
 from wpt_agents.zoo.commands.app import app

@@ -1,25 +1,28 @@
-"""One step of acting in few operators, for a CPU: what `WPTPolicy.step` defines.
+"""`acting_step` in few operators, for a CPU.
 
-tests/test_acting.py holds the two equal. At batch 1 the arithmetic is little; the time goes into
-calling operators, into reading weights across their order in memory, and into copying them in
-another. Here the copies are kept, and made anew when a weight has changed: between two episodes,
-not between two steps.
+At batch 1 there is little arithmetic. The time goes into calling operators, into reading weights
+across their order in memory, and into copying them into another order. Here these copies are kept,
+and are made again only when weights have changed: between two episodes, not between two steps.
 """
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 import torch.nn.functional as F
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
-from wpt_agents.fast.scan import split_in_blocks
+from wpt_agents.fast.conditions import on_cpu
+from wpt_agents.fast.tape import in_blocks, out_of_blocks, split_in_blocks
 from wpt_agents.model.actor_critic import Actor
-from wpt_agents.model.networks import Encoder, split_gates
-from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.distributions import Noise, exponential
+from wpt_agents.model.images import Encoder
+from wpt_agents.model.policy import WPTPolicy, acting_step
+from wpt_agents.model.rssm import RSSM, Latent, split_gates
 
-PATCHES = 256  # of several images; up to so many, a convolution is quicker as a matrix product
-WIDE_STOCH = 1024  # from so many numbers in z on, picking rows is quicker than a matrix product
+PATCHES = 256  # up to so many patches of several images, a product is faster than a convolution
+WIDE_STOCH = 1024  # from so many numbers in z on, picking rows is faster than a product
 
 
 class Layer(NamedTuple):
@@ -41,7 +44,7 @@ def norm_silu(x: Tensor, norm: nn.LayerNorm) -> Tensor:
 
 
 def linear_norm(layers: Iterable[Any]) -> Layer:
-    """A `LinearNorm` as a Layer."""
+    """Return a `LinearNorm` as a Layer."""
     linear, norm, _ = layers
     return Layer(linear.weight.t(), linear.bias, norm)
 
@@ -49,13 +52,15 @@ def linear_norm(layers: Iterable[Any]) -> Layer:
 class OneHotProduct:
     """z W' + x for a z (N, S, C) whose groups are one-hot, or zero where an episode begins.
 
-    A wide z picks the columns of W at its ones: a C-th of W is read, and reading takes the time.
+    If z is wide, the columns of W at its ones are picked: that reads only a C-th of W, and reading
+    takes the time.
 
     :param weight: W, (outputs, S C)
     """
 
     def __init__(self, weight: Tensor, classes: int) -> None:
-        self.matrix, wide = weight.t(), weight.shape[1] >= WIDE_STOCH
+        wide = weight.shape[1] >= WIDE_STOCH
+        self.matrix = weight.t()
         self.rows = self.matrix.contiguous() if wide else None
         self.first = torch.arange(0, weight.shape[1], classes)
 
@@ -71,21 +76,25 @@ class OneHotProduct:
 class FastConv:
     """A convolution of stride 2, its norm and SiLU, channels last: (N, H, W, C) -> (N, H', W', C').
 
-    Few patches are one matrix product; that spares oneDNN's reordering of the weights.
+    Few patches are one product of matrices, which spares oneDNN's reordering of the weights.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, norm: nn.LayerNorm) -> None:
-        self.weight, self.bias = weight.contiguous(memory_format=torch.channels_last), bias
+        self.weight = weight.contiguous(memory_format=torch.channels_last)
+        self.bias = bias
         self.matrix = self.weight.permute(0, 2, 3, 1).flatten(1).t()
         self.norm = norm
 
     def __call__(self, x: Tensor) -> Tensor:
         """(N, H, W, C) -> (N, H // 2 - 1, W // 2 - 1, C')."""
         n, height, width, channels = x.shape
-        rows, columns, line = height // 2 - 1, width // 2 - 1, width * channels
+        rows = height // 2 - 1
+        columns = width // 2 - 1
+        line = width * channels
         if n > 1 and n * rows * columns > PATCHES:
             x = F.conv2d(x.permute(0, 3, 1, 2), self.weight, self.bias, 2).permute(0, 2, 3, 1)
             return norm_silu(x, self.norm)
+        # the pixels of a patch's line are adjacent in memory: 4 lines of 4 pixels
         patches = x.as_strided(
             (n, rows, columns, 4, 4 * channels),
             (height * line, 2 * line, 2 * channels, line, 1),
@@ -95,16 +104,18 @@ class FastConv:
 
 
 class FastEncoder:
-    """e(o), the four channels' vectors of its 2 x 2 pixels one after the other."""
+    """e(o), with the channels of each of its 2 x 2 pixels side by side."""
 
     def __init__(self, encoder: Encoder) -> None:
         layers = list[Any](encoder.layers)
-        convs, norms = layers[::3], layers[1::3]
-        weights, biases = [conv.weight for conv in convs], [conv.bias for conv in convs]
-        # `to_unit` within the first layer's weights
+        convs = layers[::3]
+        norms = layers[1::3]
+        weights = [conv.weight for conv in convs]
+        biases = [conv.bias for conv in convs]
+        # `to_unit`, o / 255 - 0.5, becomes part of the first layer: W (o / 255 - 0.5) + b
         biases[0] = biases[0] - 0.5 * weights[0].sum((1, 2, 3))
         weights[0] = weights[0] / 255
-        self.layers = [FastConv(*each) for each in zip(weights, biases, norms, strict=True)]
+        self.layers = [FastConv(*layer) for layer in zip(weights, biases, norms, strict=True)]
 
     def __call__(self, image: Tensor) -> Tensor:
         """(N, 64, 64, C) uint8 -> (N, E)."""
@@ -116,68 +127,64 @@ class FastEncoder:
 
 
 class FastFilter:
-    """`RSSM.filter_step`, with the layers that see several inputs as one matrix each."""
+    """`filter_step`, with one matrix for each layer that sees several inputs."""
 
     def __init__(self, rssm: RSSM) -> None:
-        gru, size, width = rssm.gru, rssm.size, rssm.size.deter // rssm.gru.blocks
-        self.size, self.unimix, self.blocks = size, rssm.unimix, gru.blocks
-        self.from_deter, self.from_action = map(linear_norm, (gru.from_deter, gru.from_action))
+        gru = rssm.gru
+        size = rssm.size
+        self.size = size
+        self.unimix = rssm.unimix
+        self.blocks = gru.blocks
+        self.layout = gru.layout
+        self.from_deter = linear_norm(gru.from_deter)
+        self.from_action = linear_norm(gru.from_action)
         from_stoch, self.stoch_norm, _ = list[Any](gru.from_stoch)
         self.from_stoch = OneHotProduct(from_stoch.weight, size.classes)
         self.stoch_bias = from_stoch.bias
-        self.shared = gru.shared_weight().t().contiguous().t()
-        self.hidden_bias, self.own = gru.hidden.bias, gru.hidden.weight[:, :width]
-        self.norm, self.gates = gru.norm, gru.gates.weight
-        self.layout, gates_bias = gru.layout, gru.gates.bias.detach().clone()
+        width = size.deter // gru.blocks
+        self.private = gru.hidden.weight[:, :width]
+        shared = gru.hidden.weight[:, width:].transpose(0, 1).flatten(1)  # (inputs, D)
+        self.shared = shared.t().contiguous().t()
+        self.hidden_bias = gru.hidden.bias
+        self.norm = gru.norm
+        self.gates = gru.gates.weight
+        gates_bias = gru.gates.bias.detach().clone()
         split_gates(gates_bias[None], gru.blocks, gru.layout)[2].sub_(1)  # of the update gate
         self.gates_bias = gates_bias.view(gru.blocks, 1, -1)
-        from_deter, from_embed = rssm.post_in.weight.split(
-            [size.deter, rssm.post_in.in_features - size.deter], 1
-        )
+        from_deter = rssm.post_in.weight[:, : size.deter]
+        from_embed = rssm.post_in.weight[:, size.deter :]
         pixels = from_embed.unflatten(1, (-1, 2, 2)).permute(0, 2, 3, 1).flatten(1)
         norm, _, self.post_out = list[Any](rssm.post_out)
         self.post = Layer(torch.cat([from_deter, pixels], 1).t(), rssm.post_in.bias, norm)
 
     def __call__(
-        self,
-        state: Latent,
-        action: Tensor,
-        embed: Tensor,
-        generator: Generator | None,
-        sample: bool,
+        self, state: Latent, action: Tensor, embed: Tensor, generator: Noise, sample: bool
     ) -> Latent:
-        """One step from (N, ...), reset already where an episode begins.
+        """Make one step from a state (N, ...) that is zero where an episode begins.
 
         :param embed: of `FastEncoder`
         """
         deter = self._next_deter(state, action)
-        logits = torch.addmm(
-            self.post_out.bias, self.post(torch.cat([deter, embed], 1)), self.post_out.weight.t()
-        ).view(state.stoch.shape)
-        if sample:  # as `sample_one_hot` draws
+        hidden = self.post(torch.cat([deter, embed], 1))
+        logits = torch.addmm(self.post_out.bias, hidden, self.post_out.weight.t())
+        logits = logits.view(state.stoch.shape)
+        if sample:  # as `unimix_logits` mixes and `sample_one_hot` draws
             probs = logits.softmax(-1).mul_(1 - self.unimix).add_(self.unimix / self.size.classes)
-            logits = probs.div_(torch.empty_like(probs).exponential_(generator=generator))
+            logits = probs.div_(exponential(probs, generator))
         index = logits.argmax(-1, keepdim=True)
         return Latent(deter, torch.zeros_like(logits).scatter_(-1, index, 1.0))
 
     def _next_deter(self, state: Latent, action: Tensor) -> Tensor:
-        n, blocks = len(action), self.blocks
         from_stoch = norm_silu(self.from_stoch(self.stoch_bias, state.stoch), self.stoch_norm)
-        seen = self.from_deter(state.deter), from_stoch, self.from_action(action)
-        inputs = torch.cat(seen, 1)
-        own = in_blocks(state.deter, blocks)
-        shared = torch.addmm(self.hidden_bias, inputs, self.shared)
-        hidden = torch.baddbmm(in_blocks(shared, blocks), own, self.own)
-        hidden = norm_silu(hidden.transpose(0, 1).reshape(n, -1), self.norm)
-        gates = torch.baddbmm(self.gates_bias, in_blocks(hidden, blocks), self.gates)
+        inputs = [self.from_deter(state.deter), from_stoch, self.from_action(action)]
+        shared = torch.addmm(self.hidden_bias, torch.cat(inputs, 1), self.shared)
+        deter = in_blocks(state.deter, self.blocks)
+        hidden = torch.baddbmm(in_blocks(shared, self.blocks), deter, self.private)
+        hidden = norm_silu(out_of_blocks(hidden), self.norm)
+        gates = torch.baddbmm(self.gates_bias, in_blocks(hidden, self.blocks), self.gates)
         reset, candidate, update = split_in_blocks(gates, self.layout)
         candidate = torch.sigmoid(reset).mul_(candidate).tanh_()
-        return own.lerp(candidate, torch.sigmoid(update)).transpose(0, 1).reshape(n, -1)
-
-
-def in_blocks(x: Tensor, blocks: int) -> Tensor:
-    """(N, width) -> (blocks, N, width / blocks)."""
-    return x.reshape(len(x), blocks, -1).transpose(0, 1)
+        return out_of_blocks(deter.lerp(candidate, torch.sigmoid(update)))
 
 
 class FastActor:
@@ -185,7 +192,8 @@ class FastActor:
 
     def __init__(self, actor: Actor, classes: int) -> None:
         block, self.norm, _, self.from_deter = list[Any](actor.from_deter)
-        self.block, self.blocks = block.weight, len(block.weight)
+        self.block = block.weight
+        self.blocks = len(block.weight)
         self.block_bias = block.bias.view(self.blocks, 1, -1)
         self.from_stoch = OneHotProduct(actor.from_stoch.weight, classes)
         self.bias = self.from_deter.bias + actor.from_stoch.bias
@@ -194,8 +202,9 @@ class FastActor:
 
     def __call__(self, state: Latent) -> Tensor:
         """(N, ...) -> (N, 2 A)."""
-        x = torch.baddbmm(self.block_bias, in_blocks(state.deter, self.blocks), self.block)
-        x = norm_silu(x.transpose(0, 1).reshape(len(state.deter), -1), self.norm)
+        deter = in_blocks(state.deter, self.blocks)
+        x = out_of_blocks(torch.baddbmm(self.block_bias, deter, self.block))
+        x = norm_silu(x, self.norm)
         x = torch.addmm(self.bias, x, self.from_deter.weight.t())
         x = self.from_stoch(x, state.stoch)
         for layer in self.hidden:
@@ -204,11 +213,13 @@ class FastActor:
 
 
 class FastStep:
-    """`WPTPolicy.step` with the weights that these networks have now; see `is_of`."""
+    """`acting_step` with the weights that a policy's networks have now; see `is_current`."""
 
-    def __init__(self, encoder: Encoder, rssm: RSSM, actor: Actor) -> None:
-        self.networks = encoder, rssm, actor
-        self.encode, self.filter = FastEncoder(encoder), FastFilter(rssm)
+    def __init__(self, policy: WPTPolicy) -> None:
+        self.networks = networks_of(policy)
+        encoder, rssm, actor = self.networks
+        self.encode = FastEncoder(encoder)
+        self.filter = FastFilter(rssm)
         self.outputs = FastActor(actor, rssm.size.classes)
         self.places: list[tuple[dict[str, Any], str]] = [
             (module._parameters, name)
@@ -216,28 +227,24 @@ class FastStep:
             for module in network.modules()
             for name in module._parameters
         ]
-        self.versions = self._versions()
-        self.held = [where[name].detach() for where, name in self.places]  # no address serves twice
+        self.marks = self._marks(policy)
+        # keep the memory of the present weights, so that no other weight gets the same address
+        self.memory = [module[name].detach() for module, name in self.places]
 
-    @staticmethod
-    def takes(encoder: Encoder, rssm: RSSM, actor: Actor) -> bool:
-        """Whether these are the networks that are known here, on a CPU, and count their changes."""
-        known = type(encoder) is Encoder and type(rssm) is RSSM and type(actor) is Actor
-        bias = rssm.post_in.bias
-        return known and bias.device.type == "cpu" and not bias.is_inference()
+    def is_current(self, policy: WPTPolicy) -> bool:
+        """Return whether no weight has changed since this was made."""
+        same = all(a is b for a, b in zip(self.networks, networks_of(policy), strict=True))
+        return same and self.marks == self._marks(policy)
 
-    def is_of(self, encoder: Encoder, rssm: RSSM, actor: Actor) -> bool:
-        """Whether this was made of these networks, and no weight has changed since.
+    def _marks(self, policy: WPTPolicy) -> tuple[int, list[tuple[int, int]]]:
+        """Return the policy's count of updates, and each weight's address and version.
 
-        Changes are known by autograd's version counters; whoever steps a fused optimiser, which
-        does not count, calls `torch.autograd.graph.increment_version` as `Updates` does.
+        The count is for fused optimisers, which do not raise the versions that autograd keeps.
+        Addresses and versions are for changes that nobody counts: by `AveragedModel`, by
+        `polyak_update`, by `vector_to_parameters`, or by hand.
         """
-        same = all(a is b for a, b in zip(self.networks, (encoder, rssm, actor), strict=True))
-        return same and self.versions == self._versions()
-
-    def _versions(self) -> list[tuple[int, int]]:
-        now = (where[name] for where, name in self.places)
-        return [(weight.data_ptr(), weight._version) for weight in now]
+        weights = (module[name] for module, name in self.places)
+        return policy.updates, [(weight.data_ptr(), weight._version) for weight in weights]
 
     def __call__(
         self,
@@ -245,13 +252,57 @@ class FastStep:
         state: Latent,
         action: Tensor,
         is_first: Tensor,
-        generator: Generator | None = None,
-        sample: bool = True,
+        generator: Noise,
+        sample: bool,
     ) -> tuple[Latent, Tensor]:
-        """The new state, and the actor's outputs (N, 2 A) there."""
+        """Return the new state, and the actor's outputs (N, 2 A) there."""
         if is_first.any():
             keep = (~is_first).float()[:, None]
             state = Latent(state.deter * keep, state.stoch * keep[..., None])
             action = action * keep
         state = self.filter(state, action, self.encode(image), generator, sample)
         return state, self.outputs(state)
+
+
+# A policy's fast step, as long as the policy exists. It is not an attribute of the policy, so that
+# copying, pickling and saving a policy need not know of it.
+_fast_steps: WeakKeyDictionary[WPTPolicy, FastStep] = WeakKeyDictionary()
+
+
+def networks_of(policy: WPTPolicy) -> tuple[Encoder, RSSM, Actor]:
+    """Return the networks that act."""
+    return policy.world_model.encoder, policy.world_model.rssm, policy.actor
+
+
+def fast_step(policy: WPTPolicy) -> FastStep:
+    """Return the step for the policy's present weights, made again if they have changed."""
+    step = _fast_steps.get(policy)
+    if step is None or not step.is_current(policy):
+        step = FastStep(policy)
+        _fast_steps[policy] = step
+    return step
+
+
+def networks_are_known(policy: WPTPolicy, *_: Any, **__: Any) -> bool:
+    """Return whether these classes act, not subclasses, on a CPU, with weights that have versions.
+
+    `torch.compile` and users replace networks by others, of which nothing is known here. Weights
+    that were made in `torch.inference_mode` have no versions.
+    """
+    encoder, rssm, actor = networks_of(policy)
+    known = type(encoder) is Encoder and type(rssm) is RSSM and type(actor) is Actor
+    return known and on_cpu(rssm.post_in.bias) and not rssm.post_in.bias.is_inference()
+
+
+@acting_step.faster(when=networks_are_known)
+def acting_step_with_copies(
+    policy: WPTPolicy,
+    image: Tensor,
+    state: Latent,
+    action: Tensor,
+    is_first: Tensor,
+    generator: Noise = None,
+    sample: bool = True,
+) -> tuple[Latent, Tensor]:
+    """`acting_step` with copies of the weights in the order in which they are read."""
+    return fast_step(policy)(image, state, action, is_first, generator, sample)

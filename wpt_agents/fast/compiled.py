@@ -1,66 +1,95 @@
-"""The two loops of an update for `torch.compile`, where launches take as long as arithmetic: a GPU.
+"""Filtering steps and dreams by `torch.compile`, for a GPU.
 
-What is compiled are the definitions, `RSSM.loop_body` and `WPTPolicy.imagine`. Compiled code knows
-no generators, so random numbers are drawn before, in the same order: the same seed gives the same.
+There, launching an operator takes as long as computing it, and compiled code launches fewer. What
+is compiled are the definitions. Compiled code cannot use generators, so random numbers are
+drawn before, in the same order: the same seed gives the same results.
 """
 
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from wpt_agents.model.distributions import Drawn, exponential, uniform
-from wpt_agents.model.policy import Dream, WPTPolicy
-from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.distributions import Drawn, Noise, exponential, uniform
+from wpt_agents.model.policy import Dream, WPTPolicy, imagine
+from wpt_agents.model.rssm import RSSM, Latent, filter_step
 
-LoopBody = Callable[..., tuple[Tensor, Tensor, Tensor]]
+Step = Callable[..., tuple[Latent, Tensor]]
+
+# The networks that `compile_loops` was called for. A copy of a network is not among them.
+_steps: WeakKeyDictionary[RSSM, Step] = WeakKeyDictionary()
+_dreams: WeakKeyDictionary[WPTPolicy, Callable[..., Dream]] = WeakKeyDictionary()
 
 
-def compile_loops(policy: WPTPolicy, backend: str = "inductor") -> None:
-    """Has a policy run the scan's steps and its dreams compiled, from their first call on.
+def compile_loops(policy: WPTPolicy, backend: str | Callable[..., Any] = "inductor") -> None:
+    """Compile a policy's filtering steps and dreams, from their first call on.
 
-    On a CPU the scan by hand (scan.py) goes on, and only the dreams are compiled.
+    On a CPU, sequences are still filtered by scan.py, and only the dreams are compiled.
 
     :param backend: of `torch.compile`
     """
-    rssm = policy.world_model.rssm
-    rssm.loop_body = _loop_body(rssm, backend)  # type: ignore[method-assign]
-    policy.imagine = _imagine(policy, backend)  # type: ignore[method-assign]
+    # the functions must not refer to their keys, or these would never be forgotten
+    _steps[policy.world_model.rssm] = torch.compile(
+        _step, backend=backend, dynamic=False, fullgraph=True
+    )
+    _dreams[policy] = torch.compile(_dream, backend=backend, dynamic=False, fullgraph=True)
 
 
-def _loop_body(rssm: RSSM, backend: str) -> LoopBody:
-    define: LoopBody = rssm.loop_body
-    size = rssm.size
-
-    def sampling(*inputs: Tensor, draw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return define(*inputs, Drawn([draw]))
-
-    compiled = torch.compile(sampling, backend=backend, dynamic=False, fullgraph=True)
-
-    def loop_body(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *tensors, generator, sample = inputs
-        if not sample:
-            return define(*inputs)
-        like = tensors[0].new_empty(len(tensors[0]), size.stoch, size.classes, dtype=torch.float32)
-        return compiled(*tensors, draw=exponential(like, generator))
-
-    return loop_body
+def _step(
+    rssm: RSSM, state: Latent, inputs: tuple[Tensor, Tensor, Tensor], draw: Tensor
+) -> tuple[Latent, Tensor]:
+    return filter_step.definition(rssm, state, *inputs, Drawn([draw]))
 
 
-def _imagine(policy: WPTPolicy, backend: str) -> Callable[..., Dream]:
-    define = policy.imagine
+def _dream(policy: WPTPolicy, start: Latent, horizon: int, draws: list[Tensor]) -> Dream:
+    return imagine.definition(policy, start, horizon, Drawn(draws))
 
-    def drawn(start: Latent, horizon: int, draws: list[Tensor]) -> Dream:
-        return define(start, horizon, Drawn(draws))
 
-    compiled = torch.compile(drawn, backend=backend, dynamic=False, fullgraph=True)
+def step_is_compiled(
+    rssm: RSSM,
+    state: Latent,
+    action_embed: Tensor,
+    embed_half: Tensor,
+    is_first: Tensor,
+    generator: Noise = None,
+    sample: bool = True,
+) -> bool:
+    """Return whether the step samples, in an RSSM that `compile_loops` was called for."""
+    return sample and rssm in _steps
 
-    def imagine(start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
-        action = start.stoch.new_empty(len(start.stoch), policy.max_action_dim, dtype=torch.float32)
-        code, draws = torch.empty_like(start.stoch, dtype=torch.float32), list[Tensor]()
-        for _ in range(horizon):
-            draws += [uniform(action, generator), exponential(code, generator)]
-        return compiled(start, horizon, draws)
 
-    return imagine
+@filter_step.faster(when=step_is_compiled)
+def compiled_filter_step(
+    rssm: RSSM,
+    state: Latent,
+    action_embed: Tensor,
+    embed_half: Tensor,
+    is_first: Tensor,
+    generator: Noise = None,
+    sample: bool = True,
+) -> tuple[Latent, Tensor]:
+    """`filter_step`, compiled."""
+    draw = exponential(torch.empty_like(state.stoch, dtype=torch.float32), generator)
+    return _steps[rssm](rssm, state, (action_embed, embed_half, is_first), draw)
+
+
+def dream_is_compiled(
+    policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None
+) -> bool:
+    """Return whether `compile_loops` was called for the policy."""
+    return policy in _dreams
+
+
+@imagine.faster(when=dream_is_compiled)
+def compiled_imagine(
+    policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None
+) -> Dream:
+    """`imagine`, compiled."""
+    action = start.stoch.new_empty(len(start.stoch), policy.max_action_dim, dtype=torch.float32)
+    code = torch.empty_like(start.stoch, dtype=torch.float32)
+    draws = []
+    for _ in range(horizon):
+        draws += [uniform(action, generator), exponential(code, generator)]
+    return _dreams[policy](policy, start, horizon, draws)

@@ -1,210 +1,77 @@
-"""The scan of `RSSM.observe` with its gradients written out, for a CPU.
+"""`filter_sequence` with its gradients written out, for training on a CPU.
 
-`RSSM._filter` is the definition; tests/test_scan.py holds this equal to it, gradients too. Autograd
-would go back through some 400 small operators a step and add up every weight's gradient step by
-step. Here going back takes some 30 operators a step, for the states' gradients alone; what the
-layers saw and the slopes at their outputs are kept, and each weight gets its gradient at the end,
-from one matmul over all steps.
+Autograd would go back through about 400 small operators a step and add up every weight's gradient
+step by step. Here a step back takes about 30 operators, for the gradients of the states alone. What
+each layer saw and the slopes at its outputs are kept (tape.py), and each weight gets its gradient
+at the end, from one product over all steps. A GPU would gain less: it computes small
+operators while Python is already at the next ones.
 """
 
 from typing import Any, NamedTuple
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from wpt_agents.model.distributions import exponential
+from wpt_agents.fast.conditions import on_cpu
+from wpt_agents.fast.tape import Blocks, Gates, Linear, NormSiLU, in_blocks, out_of_blocks
+from wpt_agents.model.distributions import Noise, exponential
+from wpt_agents.model.rssm import RSSM, Latent, filter_sequence
 
 aten = torch.ops.aten
 
 
 class Constants(NamedTuple):
-    """What a scan needs to know besides its weights; see `Size`."""
+    """What a scan needs besides its weights; see `Size`."""
 
     unimix: float
     gates: str
     norm_eps: float
 
 
-class Tape:
-    """A layer of the scan: what it saw at each step, and the slopes that came back, last first."""
-
-    def __init__(self) -> None:
-        self.seen: list[Any] = []
-        self.slopes: list[Tensor] = []
-
-    def all_slopes(self, dim: int = 0) -> Tensor:
-        """Those of all steps, first step first, joined along `dim`."""
-        return torch.cat(self.slopes[::-1], dim)
-
-
-class Linear(Tape):
-    """x W^T + b; b is the layer's own or another one at each step."""
-
-    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
-        super().__init__()
-        self.weight, self.bias, self.transposed = weight, bias, weight.t()
-
-    def forward(self, x: Tensor, bias: Tensor | None = None) -> Tensor:
-        """(N, inputs) -> (N, outputs)."""
-        self.seen.append(x)
-        bias = self.bias if bias is None else bias
-        assert bias is not None, "neither the layer nor the step has a bias"
-        return torch.addmm(bias, x, self.transposed)
-
-    def backward(self, slope: Tensor, other: Tensor | None = None) -> Tensor:
-        """(N, outputs) -> (N, inputs), plus `other`."""
-        self.slopes.append(slope)
-        return slope @ self.weight if other is None else torch.addmm(other, slope, self.weight)
-
-    def gradients(self) -> list[Tensor]:
-        """Of the weight, and of the bias if it is the layer's own."""
-        slope = self.all_slopes()
-        gradients = [slope.t() @ torch.cat(self.seen)]
-        return gradients if self.bias is None else [*gradients, slope.sum(0)]
-
-
-class Blocks(Tape):
-    """`BlockLinear` with the blocks in front: (b, N, inputs / b) -> (b, N, outputs / b)."""
-
-    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
-        super().__init__()
-        self.weight, self.transposed = weight, weight.transpose(1, 2)
-        self.bias = None if bias is None else bias.view(len(weight), 1, -1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """One step."""
-        self.seen.append(x)
-        if self.bias is None:
-            return torch.bmm(x, self.weight)
-        return torch.baddbmm(self.bias, x, self.weight)
-
-    def backward(self, slope: Tensor) -> Tensor:
-        """(b, N, outputs / b) -> (b, N, inputs / b)."""
-        self.slopes.append(slope)
-        return torch.bmm(slope, self.transposed)
-
-    def gradients(self) -> list[Tensor]:
-        """Of the weight and the bias, if there is one."""
-        slope = self.all_slopes(1)
-        gradients = [torch.cat(self.seen, 1).transpose(1, 2) @ slope]
-        return gradients if self.bias is None else [*gradients, slope.sum(1).flatten()]
-
-
-class NormSiLU(Tape):
-    """SiLU(LayerNorm(x)): (N, width) -> (N, width)."""
-
-    def __init__(self, weight: Tensor, bias: Tensor, eps: float) -> None:
-        super().__init__()
-        self.weight, self.bias, self.eps = weight, bias, eps
-
-    def forward(self, x: Tensor) -> Tensor:
-        """One step."""
-        normed, *moments = aten.native_layer_norm(
-            x, self.weight.shape, self.weight, self.bias, self.eps
-        )
-        self.seen.append((x, normed, *moments))
-        return aten.silu(normed)
-
-    def backward(self, t: int, slope: Tensor) -> Tensor:
-        """The slope at the input of step t."""
-        x, normed, *moments = self.seen[t]
-        self.slopes.append(aten.silu_backward(slope, normed))
-        return self._backward(self.slopes[-1], x, moments, [True, False, False])[0]
-
-    def gradients(self) -> list[Tensor]:
-        """Of the weight and the bias."""
-        x, _, *moments = (torch.cat(each) for each in zip(*self.seen, strict=True))
-        return list(self._backward(self.all_slopes(), x, moments, [False, True, True])[1:])
-
-    def _backward(
-        self, slope: Tensor, x: Tensor, moments: list[Tensor], wanted: list[bool]
-    ) -> tuple[Tensor, ...]:
-        shape = self.weight.shape
-        return aten.native_layer_norm_backward(
-            slope, x, shape, *moments, self.weight, self.bias, wanted
-        )
-
-
-class Gates(Tape):
-    """The GRU's gates, blocks in front: (b, N, 3 D / b) and h (b, N, D / b) -> the next h.
-
-    :param layout: `Size.gates`
-    """
-
-    def __init__(self, layout: str) -> None:
-        super().__init__()
-        self.layout = layout
-
-    def forward(self, gates: Tensor, deter: Tensor) -> Tensor:
-        """One step."""
-        reset, candidate, update = split_in_blocks(gates, self.layout)
-        reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)
-        new = torch.tanh(reset * candidate)
-        self.seen.append((reset, candidate, update, new, deter))
-        return torch.lerp(deter, new, update)
-
-    def backward(self, t: int, slope: Tensor) -> tuple[Tensor, Tensor]:
-        """The slopes at gates and h of step t."""
-        reset, candidate, update, new, deter = self.seen[t]
-        to_new = slope * update
-        to_update = aten.sigmoid_backward(slope * (new - deter), update)
-        to_product = aten.tanh_backward(to_new, new)
-        to_reset = aten.sigmoid_backward(to_product * candidate, reset)
-        return self._joined(to_reset, to_product * reset, to_update), slope - to_new
-
-    def _joined(self, *gates: Tensor) -> Tensor:
-        """The inverse of `split_in_blocks`."""
-        if self.layout == "within":
-            return torch.cat(gates, 2)
-        flat = torch.stack(gates).permute(2, 0, 1, 3).flatten(1)  # (N, 3 D)
-        return flat.unflatten(1, (len(gates[0]), -1)).transpose(0, 1)
-
-
-def split_in_blocks(gates: Tensor, layout: str) -> tuple[Tensor, ...]:
-    """`split_gates` with the blocks in front: (b, N, 3 D / b) -> three times (b, N, D / b)."""
-    if layout == "within":
-        return gates.chunk(3, 2)
-    flat = gates.transpose(0, 1).flatten(1)  # (N, 3 D), the thirds of which are the gates
-    return flat.unflatten(1, (3, len(gates), -1)).permute(1, 2, 0, 3).unbind(0)
-
-
 class Steps:
-    """All layers of a step, made of the weights in the order of `RSSM._scan`."""
+    """All layers of a step, made of weights in the order in which `scan` passes them."""
 
     def __init__(self, constants: Constants, weights: tuple[Tensor, ...]) -> None:
-        w, eps = iter(weights), constants.norm_eps
-        self.deter_in, self.deter_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w), eps)
-        self.stoch_in, self.stoch_norm = Linear(next(w), next(w)), NormSiLU(next(w), next(w), eps)
-        self.shared, self.own = Linear(next(w)), Blocks(next(w))
-        self.norm, self.gates_in = NormSiLU(next(w), next(w), eps), Blocks(next(w), next(w))
+        w = iter(weights)
+        eps = constants.norm_eps
+        self.deter_in = Linear(next(w), next(w))
+        self.deter_norm = NormSiLU(next(w), next(w), eps)
+        self.stoch_in = Linear(next(w), next(w))
+        self.stoch_norm = NormSiLU(next(w), next(w), eps)
+        self.shared = Linear(next(w))
+        self.private = Blocks(next(w))
+        self.norm = NormSiLU(next(w), next(w), eps)
+        self.gates_in = Blocks(next(w), next(w))
         self.post_in = Linear(next(w))
-        self.post_norm, self.post_out = NormSiLU(next(w), next(w), eps), Linear(next(w), next(w))
-        self.gates, self.unimix = Gates(constants.gates), constants.unimix
+        self.post_norm = NormSiLU(next(w), next(w), eps)
+        self.post_out = Linear(next(w), next(w))
+        self.gates = Gates(constants.gates)
+        self.unimix = constants.unimix
         self.probs: list[Tensor] = []
         self.mixed: list[Tensor] = []
 
     @property
     def layers(self) -> list[Any]:
-        """In the order of the weights."""
+        """The layers in the order of their weights."""
         return [
             *(self.deter_in, self.deter_norm, self.stoch_in, self.stoch_norm, self.shared),
-            *(self.own, self.norm, self.gates_in, self.post_in, self.post_norm, self.post_out),
+            *(self.private, self.norm, self.gates_in, self.post_in, self.post_norm, self.post_out),
         ]
 
     def forward(
         self, deter: Tensor, stoch: Tensor, action_half: Tensor, embed_half: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """One step: the new h (N, D) and the posterior's probabilities (N, S, K)."""
-        blocks = len(self.own.weight)
+        """Make one step: the new h (N, D) and the posterior's probabilities (N, S, K)."""
+        blocks = len(self.private.weight)
         from_deter = self.deter_norm.forward(self.deter_in.forward(deter))
         from_stoch = self.stoch_norm.forward(self.stoch_in.forward(stoch.flatten(1)))
         shared = self.shared.forward(torch.cat([from_deter, from_stoch], 1), action_half)
-        in_blocks = deter.unflatten(1, (blocks, -1)).transpose(0, 1)
-        own = self.own.forward(in_blocks).transpose(0, 1)
-        hidden = self.norm.forward(own.add(shared.view(own.shape)).flatten(1))
-        gates = self.gates_in.forward(hidden.unflatten(1, (blocks, -1)).transpose(0, 1))
-        deter = self.gates.forward(gates, in_blocks).transpose(0, 1).flatten(1)
+        deter = in_blocks(deter, blocks)
+        private = self.private.forward(deter).transpose(0, 1)
+        hidden = self.norm.forward(private.add(shared.view(private.shape)).flatten(1))
+        gates = self.gates_in.forward(in_blocks(hidden, blocks))
+        deter = out_of_blocks(self.gates.forward(gates, deter))
         hidden = self.post_norm.forward(self.post_in.forward(deter, embed_half))
         probs = self.post_out.forward(hidden).view(stoch.shape).softmax(-1)
         mixed = (1 - self.unimix) * probs + self.unimix / stoch.shape[-1]
@@ -213,37 +80,35 @@ class Steps:
         return deter, mixed
 
     def backward(self, t: int, to_deter: Tensor, to_probs: Tensor) -> tuple[Tensor, Tensor]:
-        """The slopes at the h (N, D) and z (N, S, K) that step t began with.
+        """Return the slopes at the h (N, D) and z (N, S, K) that step t began with.
 
-        :param to_deter: (N, D), the slope at the new h but for the posterior's part
+        :param to_deter: (N, D), the slope at the new h, without the part through the posterior
         :param to_probs: (N, S, K), the slope at the unmixed probabilities
         """
-        blocks = len(self.own.weight)
+        blocks = len(self.private.weight)
         probs = self.probs[t]
         to_logits = aten._softmax_backward_data(to_probs, probs, -1, probs.dtype)
         to_post = self.post_norm.backward(t, self.post_out.backward(to_logits.flatten(1)))
         to_deter = self.post_in.backward(to_post, to_deter)
-        slope = to_deter.unflatten(1, (blocks, -1)).transpose(0, 1)
-        to_gates, through = self.gates.backward(t, slope)
-        to_hidden = self.gates_in.backward(to_gates).transpose(0, 1).flatten(1)
+        to_gates, through = self.gates.backward(t, in_blocks(to_deter, blocks))
+        to_hidden = out_of_blocks(self.gates_in.backward(to_gates))
         to_sum = self.norm.backward(t, to_hidden)
-        to_own = self.own.backward(to_sum.unflatten(1, (blocks, -1)).transpose(0, 1))
-        to_shared = self.shared.backward(to_sum)
-        from_deter, from_stoch = to_shared.chunk(2, 1)
-        earlier = (through + to_own).transpose(0, 1).flatten(1)
+        to_private = self.private.backward(in_blocks(to_sum, blocks))
+        from_deter, from_stoch = self.shared.backward(to_sum).chunk(2, 1)
+        earlier = out_of_blocks(through + to_private)
         to_deter = self.deter_in.backward(self.deter_norm.backward(t, from_deter), earlier)
         to_stoch = self.stoch_in.backward(self.stoch_norm.backward(t, from_stoch))
         return to_deter, to_stoch.view(probs.shape)
 
 
 class FilterScan(torch.autograd.Function):
-    """h and z of all steps, and the posteriors' probabilities, each (T, B, ...)."""
+    """h and z of all steps, and the posteriors' log-probabilities, each (T, B, ...)."""
 
     @staticmethod
     def forward(
         ctx: Any,
         constants: Constants,
-        generator: Generator | None,
+        generator: Noise,
         is_first: Tensor,
         action_half: Tensor,
         embed_half: Tensor,
@@ -251,14 +116,14 @@ class FilterScan(torch.autograd.Function):
         stoch: Tensor,
         *weights: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Filters.
+        """Filter a sequence.
 
         :param is_first: (T, B) bool
         :param action_half: (T, B, D), what the actions and the bias add before the GRU's norm
         :param embed_half: (T, B, hidden), what images and bias add before the posterior's norm
-        :param deter: (B, D), the state before the first image
-        :param stoch: (B, S, K)
-        :param weights: in the order that `Steps` takes them
+        :param deter: (B, D), h before the first image
+        :param stoch: (B, S, K), z before the first image
+        :param weights: in the order of `Steps`
         """
         steps = Steps(constants, weights)
         keep = (~is_first).to(deter.dtype)
@@ -266,10 +131,11 @@ class FilterScan(torch.autograd.Function):
         deters, stochs = [], []
         for t, reset in enumerate(resets):
             if reset:
-                deter, stoch = deter * keep[t, :, None], stoch * keep[t, :, None, None]
+                deter = deter * keep[t, :, None]
+                stoch = stoch * keep[t, :, None, None]
             deter, probs = steps.forward(deter, stoch, action_half[t], embed_half[t])
             index = (probs / exponential(probs, generator)).argmax(-1, keepdim=True)
-            stoch = torch.zeros_like(probs).scatter_(-1, index, 1.0)
+            stoch = torch.zeros_like(probs).scatter_(-1, index, 1.0)  # as `sample_one_hot`
             deters.append(deter)
             stochs.append(stoch)
         ctx.steps, ctx.keep, ctx.resets = steps, keep, resets
@@ -281,22 +147,83 @@ class FilterScan(torch.autograd.Function):
     def backward(
         ctx: Any, to_deters: Tensor, to_stochs: Tensor, to_logits: Tensor
     ) -> tuple[Tensor | None, ...]:
-        """The gradients of what `forward` took."""
+        """Return the gradients of what `forward` took."""
         steps: Steps = ctx.steps
         for layer in steps.layers:
             layer.slopes.clear()  # of an earlier way back through the same graph
         share = 1 - steps.unimix
-        # z follows the probabilities (straight-through), and their logarithm is the third output
+        # z has the gradient of the probabilities (straight-through), and their logarithm is the
+        # third output
         to_probs = (to_stochs + to_logits / ctx.mixed) * share
-        to_deter, to_stoch = torch.zeros_like(to_deters[0]), torch.zeros_like(to_stochs[0])
+        to_deter = torch.zeros_like(to_deters[0])
+        to_stoch = torch.zeros_like(to_stochs[0])
         for t in reversed(range(len(to_deters))):
             to_deter, to_stoch = steps.backward(
                 t, to_deter + to_deters[t], torch.add(to_probs[t], to_stoch, alpha=share)
             )
             if ctx.resets[t]:
                 keep = ctx.keep[t, :, None]
-                to_deter, to_stoch = to_deter * keep, to_stoch * keep[..., None]
+                to_deter = to_deter * keep
+                to_stoch = to_stoch * keep[..., None]
         to_action = torch.stack(steps.shared.slopes[::-1])
         to_embed = torch.stack(steps.post_in.slopes[::-1])
         gradients = [g for layer in steps.layers for g in layer.gradients()]
         return None, None, None, to_action, to_embed, to_deter, to_stoch, *gradients
+
+
+def learns_on_cpu(
+    rssm: RSSM,
+    embed_half: Tensor,
+    action_embed: Tensor,
+    is_first: Tensor,
+    state: Latent,
+    generator: Noise = None,
+    sample: bool = True,
+) -> bool:
+    """Return whether the sequence is sampled with gradients, on a CPU."""
+    return on_cpu(embed_half) and sample and torch.is_grad_enabled()
+
+
+@filter_sequence.faster(when=learns_on_cpu)
+def scan(
+    rssm: RSSM,
+    embed_half: Tensor,
+    action_embed: Tensor,
+    is_first: Tensor,
+    state: Latent,
+    generator: Noise = None,
+    sample: bool = True,
+) -> tuple[Latent, Tensor]:
+    """`filter_sequence` in far fewer operators, always in float32."""
+    with torch.autocast("cpu", enabled=False):  # it does not know `FilterScan`
+        return _scan(rssm, embed_half.float(), action_embed.float(), is_first, state, generator)
+
+
+def _scan(
+    rssm: RSSM,
+    embed_half: Tensor,
+    action_embed: Tensor,
+    is_first: Tensor,
+    state: Latent,
+    generator: Noise,
+) -> tuple[Latent, Tensor]:
+    gru = rssm.gru
+    size = rssm.size
+    private, shared = gru.hidden.weight.split([size.deter // gru.blocks, 3 * size.hidden], 1)
+    # the weights of the inputs that all blocks share, as matrices (inputs, D): those of h and z, a
+    matrix = shared.transpose(0, 1).flatten(1)
+    state_part, action_part = matrix.split([2 * size.hidden, size.hidden])
+    action_half = action_embed.transpose(0, 1) @ action_part + gru.hidden.bias
+    deters, stochs, logits = FilterScan.apply(  # type: ignore[no-untyped-call]
+        Constants(rssm.unimix, size.gates, size.norm_eps),
+        generator,
+        is_first.t(),
+        action_half,
+        embed_half.transpose(0, 1),
+        *state,
+        *(p for layers in (gru.from_deter, gru.from_stoch) for p in layers.parameters()),
+        *(state_part.t(), private, *gru.norm.parameters(), *gru.gates.parameters()),
+        *(rssm.post_in.weight[:, : size.deter], *rssm.post_out.parameters()),
+    )
+    post = Latent(deters.transpose(0, 1), stochs.transpose(0, 1))
+    return post, logits.transpose(0, 1)

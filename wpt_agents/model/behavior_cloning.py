@@ -93,8 +93,11 @@ class PriorActor(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(N, F, 64, 64, 3) uint8, oldest first -> (N, A), not clipped."""
-        return self.layers(self.encoder(image.permute(0, 2, 3, 1, 4).flatten(-2)))
+        stacked = image.permute(0, 2, 3, 1, 4).flatten(-2)
+        action: Tensor = self.layers(self.encoder(stacked))
+        return action
 
     def act(self, image: Tensor, mask: Tensor) -> Tensor:
         """(N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1], zero in the padding."""
-        return self(image).clamp(-1, 1) * mask
+        action: Tensor = self(image)
+        return action.clamp(-1, 1) * mask

@@ -1,8 +1,8 @@
-"""All networks in one module, and how they act: filter a latent, then the actor decides."""
+"""All networks in one module, and how they act: filter a latent state, then the actor decides."""
 
 import hashlib
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -12,12 +12,13 @@ from torch import Generator, Tensor
 
 from wpt_agents.data.images import resized
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
-from wpt_agents.fast.acting import FastStep
 from wpt_agents.model.actor_critic import Actor, Critic
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.model.distributions import Noise
-from wpt_agents.model.networks import Size, frozen
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.ops import op
 from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import Size
 from wpt_agents.model.world_model import WorldModel, world_model_update_loss
 
 IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -30,15 +31,14 @@ class Dream(NamedTuple):
     states: Latent  # (N, H + 1, ...)
     action: Tensor  # (N, H, A)
     entropy: Tensor  # (N, H), of the actor at the steps 0 .. H-1
-    saturated: Tensor  # scalar, the share of means beyond 0.99
+    saturated: Tensor  # scalar, the share of the actor's means beyond 0.99
 
 
 def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarray, bool]:
-    """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
+    """Convert observations to (n, 64, 64, 3) uint8, and return whether there was a batch axis.
 
-    Takes (H, W, 3) and (3, H, W), one or a batch; other sizes are resized.
-
-    :raises ValueError: anything that is no uint8 image
+    :param observation: (H, W, 3) or (3, H, W), one or a batch; other sizes are resized
+    :raises ValueError: anything that is not a uint8 image
     """
     observation = np.asarray(observation)
     batched = observation.ndim == 4
@@ -58,22 +58,23 @@ def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarr
 class WPTPolicy(BasePolicy):
     """World model, actor, critic, target critic and prior actor.
 
-    :param observation_space: kept as the environment has it; images are converted at the border
-    :param action_space: a Box; its width is the embodiment's own, at most `max_action_dim`
+    :param observation_space: the environment's; images are converted in `predict`
+    :param action_space: a Box; its width is the embodiment's, at most `max_action_dim`
     :param size: the widths of all networks
     :param max_action_dim: A, the padded action width of the world model
-    :param unimix: share of the uniform in every latent distribution
+    :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
     """
 
     action_space: spaces.Box
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
-    return_scale: Tensor  # scalar, what returns are divided by; 0 before the first returns
+    return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
+    updates: int  # raised whenever weights have changed: caches of them look at it
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         size: Size,
         max_action_dim: int,
@@ -82,18 +83,22 @@ class WPTPolicy(BasePolicy):
         actor_outscale: float = 1.0,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
-        self.size, self.max_action_dim = size, max_action_dim
-        self.zero_init_heads, self.actor_outscale = zero_init_heads, actor_outscale
+        self.updates = 0
+        self.size = size
+        self.max_action_dim = max_action_dim
+        self.unimix = unimix
+        self.zero_init_heads = zero_init_heads
+        self.actor_outscale = actor_outscale
         self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
-        self._fast_step: FastStep | None = None
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
-        """Draws all that belongs to a task anew: reward head, actor, critic, prior actor."""
-        size, device = self.size, self.device
+        """Draw new weights for all that belongs to a task: reward head, actor, critic, clone."""
+        size = self.size
+        device = self.device
         self.world_model.reset_reward_head()
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
@@ -102,14 +107,27 @@ class WPTPolicy(BasePolicy):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
         self.return_scale.fill_(0)
+        self.updates += 1
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Load weights, as `torch.nn.Module.load_state_dict`."""
+        self.updates += 1
+        return super().load_state_dict(state_dict, strict, assign)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        self.updates += 1  # `to`, `half` and others move or convert the weights
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        return self
 
     def set_action_space(self, action_space: spaces.Box) -> None:
-        """Acts in this space from now on; entries past its width are masked everywhere."""
+        """Act in this space from now on; entries past its width are masked everywhere."""
         self.action_space = action_space
         self.action_mask[:] = torch.arange(self.max_action_dim) < action_space.shape[0]
 
     def initial_state(self, n: int) -> State:
-        """The acting state of n fresh episodes: h (n, D), z (n, S, K), previous action (n, A)."""
+        """Return the acting state of n new episodes: h (n, D), z (n, S, K), last action (n, A)."""
         shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
         return tuple(np.zeros(s, np.float32) for s in (*shapes, (n, self.max_action_dim)))
 
@@ -122,31 +140,25 @@ class WPTPolicy(BasePolicy):
         deterministic: bool = False,
         generator: Generator | None = None,
     ) -> tuple[np.ndarray, State]:
-        """One step of filtering and acting.
+        """Make one step of filtering and acting.
 
         :param image: (n, 64, 64, 3) uint8
         :param state: from the step before, or None
         :param episode_start: (n,) bool, where the state is reset
-        :param deterministic: take the likeliest latent and the mean action
+        :param deterministic: take the most likely latent and the mean action
         :param generator: of the draws; torch's own if None
         :return: action (n, A) in [-1, 1], zero in the padding, and the new state
         """
         n = len(image)
         if state is not None and len(state[0]) != n:
             raise ValueError(
-                f"The state is of {len(state[0])} environments, the observation of {n}: pass "
-                "state=None where all episodes begin"
+                f"The state is that of {len(state[0])} environments, but there are {n} "
+                "observations: pass state=None if all episodes begin"
             )
         *latent, action = (self._tensor(x) for x in state or self.initial_state(n))
         first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
-        post, outputs = self._stepper()(
-            self._tensor(image),
-            Latent(*latent),
-            action,
-            self._tensor(first),
-            generator,
-            sample=not deterministic,
-        )
+        inputs = self._tensor(image), Latent(*latent), action, self._tensor(first)
+        post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.actor.truncated(outputs, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
         state = tuple(x.cpu().numpy() for x in (*post, action))
@@ -158,45 +170,17 @@ class WPTPolicy(BasePolicy):
         """Return the acting state after `action` (n, A) was executed instead of the policy's."""
         return (*state[:-1], action)
 
-    def step(
-        self,
-        image: Tensor,
-        state: Latent,
-        action: Tensor,
-        is_first: Tensor,
-        generator: Generator | None = None,
-        sample: bool = True,
-    ) -> tuple[Latent, Tensor]:
-        """One step of filtering and the actor's outputs; `FastStep` computes the same on a CPU.
-
-        :param image: (N, 64, 64, 3) uint8
-        :param state: of the step before, (N, ...)
-        :param action: (N, A), what led to the image
-        :param is_first: (N,) bool, where state and action are reset
-        :return: the posterior state, and what `Actor.truncated` takes, (N, 2 A)
-        """
-        rssm, embed = self.world_model.rssm, self.world_model.encoder(image)
-        post = rssm.filter_step(state, action, embed, is_first, generator, sample)
-        return post, self.actor(post.feat)
-
-    def _stepper(self) -> Callable[..., tuple[Latent, Tensor]]:
-        """`step`, or the like of it that was made for the present weights."""
-        networks = self.world_model.encoder, self.world_model.rssm, self.actor
-        if not FastStep.takes(*networks):
-            return self.step
-        if self._fast_step is None or not self._fast_step.is_of(*networks):
-            self._fast_step = FastStep(*networks)
-        return self._fast_step
-
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array)).to(self.action_mask.device)
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
         """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
-        low, high = self.action_space.low, self.action_space.high
-        own = action[:, : len(low)].clip(-1, 1)
-        action = low + 0.5 * (own + 1) * (high - low)
-        return action.clip(low, high).astype(self.action_space.dtype)  # rounding may overstep
+        low = self.action_space.low
+        high = self.action_space.high
+        action = action[:, : len(low)].clip(-1, 1)
+        action = low + 0.5 * (action + 1) * (high - low)
+        action = action.clip(low, high)  # rounding may overstep
+        return np.asarray(action, self.action_space.dtype)
 
     def predict(
         self,
@@ -205,7 +189,7 @@ class WPTPolicy(BasePolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
-        """The action in the environment's own space, and the recurrent state to hand back.
+        """Return the action in the environment's own space, and the state for the next call.
 
         :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
             are converted
@@ -217,42 +201,28 @@ class WPTPolicy(BasePolicy):
         action = self.to_env(action)
         return (action if batched else action[0]), state
 
-    def _predict(  # type: ignore[override]  # images alone, no dictionaries of them
+    def _predict(  # type: ignore[override]  # no dictionaries of images
         self, observation: Tensor, deterministic: bool = False
     ) -> Tensor:
-        """SB3's stateless form: every observation is taken for an episode's first."""
+        """Act as SB3's stateless policies do: every observation is an episode's first."""
         images, _ = to_images(observation.cpu().numpy())
         return self._tensor(self.to_env(self.act(images, None, None, deterministic)[0]))
 
     def dream(self, start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
-        """Imagines with the actor in the frozen world model; gradients run through the dynamics.
+        """Imagine with the actor in the frozen world model; gradients run through the dynamics.
 
         :param start: (N, ...), the states to start from
         """
         with frozen(self.world_model):
-            return self.imagine(start.detach(), horizon, generator)
-
-    def imagine(self, start: Latent, horizon: int, generator: Noise = None) -> Dream:
-        """The loop of `dream`."""
-        entropies, saturated = [], []
-
-        def policy(state: Latent, _: int) -> Tensor:
-            dist = self.actor.dist(state.feat.detach(), self.action_mask)
-            entropies.append(dist.entropy())
-            saturated.append(((dist.mean.detach().abs() > 0.99) & self.action_mask).float().sum(-1))
-            return dist.rsample(generator)
-
-        states, action = self.world_model.rssm.imagine(start, policy, horizon, generator)
-        share = torch.stack(saturated).mean() / self.action_mask.sum()
-        return Dream(states, action, torch.stack(entropies, 1), share)
+            return imagine(self, start.detach(), horizon, generator)
 
     @torch.no_grad()
     def embed(self, image: np.ndarray) -> np.ndarray:
         """e(o) of Eq. (5): (n, 64, 64, 3) uint8 -> (n, E) float32."""
-        return self.world_model.encoder(self._tensor(image)).float().cpu().numpy()
+        return np.asarray(self.world_model.encoder(self._tensor(image)).float().cpu())
 
     def encoder_id(self) -> str:
-        """A hash of the encoder's weights, by which an index knows whose features it holds."""
+        """Return a hash of the encoder's weights, stored with features that it computed."""
         digest = hashlib.sha256()
         for tensor in self.world_model.encoder.state_dict().values():
             digest.update(tensor.cpu().numpy().tobytes())
@@ -260,7 +230,7 @@ class WPTPolicy(BasePolicy):
 
     @torch.no_grad()
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """What the world model expects to see: `context` reconstructions, then a dream.
+        """Predict a trajectory's images: `context` reconstructions, then a dream.
 
         :return: (context + horizon or the trajectory's images, 64, 64, 3) uint8
         """
@@ -272,9 +242,9 @@ class WPTPolicy(BasePolicy):
 
     @torch.no_grad()
     def heldout_errors(self, trajectory: Trajectory, images: int = 256) -> dict[str, float]:
-        """How far the world model is off on an episode with rewards that it has not replayed yet.
+        """Measure the world model's errors on an episode with rewards, not yet replayed.
 
-        :param images: at most so many, from the episode's start
+        :param images: the most images that are used, from the episode's start
         :return: `reconstruction`, the squared error of Eq. (1) summed over an image, and `reward`,
             the mean absolute error; both averaged over the steps
         """
@@ -287,14 +257,63 @@ class WPTPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
-            **super()._get_constructor_parameters(),
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
             "size": self.size,
             "max_action_dim": self.max_action_dim,
+            "unimix": self.unimix,
+            "zero_init_heads": self.zero_init_heads,
+            "actor_outscale": self.actor_outscale,
         }
 
 
+@op
+def acting_step(
+    policy: WPTPolicy,
+    image: Tensor,
+    state: Latent,
+    action: Tensor,
+    is_first: Tensor,
+    generator: Noise = None,
+    sample: bool = True,
+) -> tuple[Latent, Tensor]:
+    """Make one step of filtering and compute the actor's outputs.
+
+    :param image: (N, 64, 64, 3) uint8
+    :param state: of the step before, (N, ...)
+    :param action: (N, A), the action that led to the image
+    :param is_first: (N,) bool, where state and action are reset
+    :return: the posterior state, and the argument of `Actor.truncated`, (N, 2 A)
+    """
+    model = policy.world_model
+    embed = model.encoder(image)
+    post, _ = model.rssm.filter(  # a sequence of one step
+        embed[:, None], action[:, None], is_first[:, None], state, generator, sample
+    )
+    post = post.flatten_time()
+    return post, policy.actor(post.feat)
+
+
+@op
+def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None) -> Dream:
+    """Imagine with the actor from N states."""
+    entropies: list[Tensor] = []
+    saturated: list[Tensor] = []
+
+    def act(state: Latent, _: int) -> Tensor:
+        dist = policy.actor.dist(state.feat.detach(), policy.action_mask)
+        entropies.append(dist.entropy())
+        beyond = (dist.mean.detach().abs() > 0.99) & policy.action_mask
+        saturated.append(beyond.float().sum(-1))
+        return dist.rsample(generator)
+
+    states, action = policy.world_model.rssm.imagine(start, act, horizon, generator)
+    share = torch.stack(saturated).mean() / policy.action_mask.sum()
+    return Dream(states, action, torch.stack(entropies, 1), share)
+
+
 class PriorPolicy:
-    """The prior actor by SB3's `predict`; its state is the last three images."""
+    """The prior actor with SB3's `predict`; its state is the last three images."""
 
     def __init__(self, policy: WPTPolicy) -> None:
         self.policy = policy
@@ -306,7 +325,7 @@ class PriorPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
-        """As `WPTPolicy.predict`; the clone has no noise to leave out."""
+        """Act as `WPTPolicy.predict`; the clone is deterministic in any case."""
         images, batched = to_images(observation)
         frames = stack_frames(images, state[0] if state else None, episode_start)
         action = self.policy.to_env(prior_action(self.policy, frames))
@@ -316,7 +335,7 @@ class PriorPolicy:
 def stack_frames(
     image: np.ndarray, frames: np.ndarray | None, episode_start: np.ndarray | None
 ) -> np.ndarray:
-    """The last three images of n episodes, the first one repeated where an episode begins.
+    """Return the last three images of n episodes, repeating the first one where an episode begins.
 
     :param image: (n, 64, 64, 3), the newest
     :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
@@ -335,4 +354,4 @@ def stack_frames(
 def prior_action(policy: WPTPolicy, frames: np.ndarray) -> np.ndarray:
     """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
     images = torch.from_numpy(frames).to(policy.device)
-    return policy.prior_actor.act(images, policy.action_mask).cpu().numpy()
+    return np.asarray(policy.prior_actor.act(images, policy.action_mask).cpu())

@@ -1,30 +1,23 @@
 """The world model and its losses: Eq. (1) world_model_loss, and reward_loss of A.3."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.files.names import unknown_name
-from wpt_agents.model.distributions import BINS, kl_one_hot, two_hot_loss, two_hot_mean
-from wpt_agents.model.networks import (
-    Decoder,
-    Encoder,
-    Head,
-    Size,
-    by_parity,
-    in_pieces,
-    to_uint8,
-    to_unit,
-)
+from wpt_agents.model.distributions import BINS, Noise, kl_one_hot, two_hot_loss, two_hot_mean
+from wpt_agents.model.images import Decoder, Encoder, to_uint8, to_unit
+from wpt_agents.model.layers import Head
+from wpt_agents.model.ops import op
 from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.sizes import Size
 
 
 class WorldModelLoss(NamedTuple):
-    """Eq. (1) and its terms, each a scalar averaged over the batch and time."""
+    """Eq. (1) and its terms: scalars, averaged over the batch and time."""
 
     total: Tensor
     reconstruction: Tensor
@@ -32,14 +25,20 @@ class WorldModelLoss(NamedTuple):
 
 
 def squared_error(image: Tensor, reconstruction: Tensor) -> Tensor:
-    """-ln p(o_t | z_t, h_t) of a Gaussian of fixed variance, up to constants: summed over a frame.
+    """-ln p(o_t | z_t, h_t) of a Gaussian with fixed variance, up to constants.
 
     :param image: (..., H, W, C), the true frames in [-0.5, 0.5], their pixels in any order
     :param reconstruction: (..., H, W, C)
-    :return: (...)
+    :return: (...), summed over a frame
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
     return F.mse_loss(reconstruction, image, reduction="none").sum((-3, -2, -1))
+
+
+@op
+def reconstruction_error(decoder: Decoder, latent: Latent, image: Tensor) -> Tensor:
+    """The `squared_error` of N decoded states: (N, ...), (N, 64, 64, 3) uint8 -> (N,)."""
+    return squared_error(to_unit(image), decoder(latent.deter, latent.stoch))
 
 
 def world_model_loss(
@@ -48,44 +47,40 @@ def world_model_loss(
     prior_logits: Tensor,
     dyn_scale: float = 1.0,
     rep_scale: float = 0.1,
-    free_nats: float = 1.0,
+    free_nats: float | Tensor = 1.0,
     free_nats_mode: str = "mean",
-    whole: Callable[[Tensor], Tensor] | None = None,
 ) -> WorldModelLoss:
     """Eq. (1): -ln p(o_t | z_t, h_t) + beta KL(q(z_t | h_t, o_t) || p(z_t | h_t)).
 
-    The KL is balanced as in DreamerV3: `dyn_scale` teaches the
-    prior, `rep_scale` the posterior; below `free_nats` a term teaches nothing.
+    The KL is balanced as in DreamerV3: `dyn_scale` weighs the term that trains the prior,
+    `rep_scale` the term that trains the posterior. A term below `free_nats` has no gradient.
 
-    :param error: (B, T), what `squared_error` makes of the first term
+    :param error: (B, T), the first term, see `squared_error`
     :param post_logits: (B, T, S, K) log-probabilities of q
     :param prior_logits: (B, T, S, K) log-probabilities of p
     :param free_nats_mode: clip the mean over the batch ("mean", as WPT) or each element ("element",
         as DreamerV3)
-    :param whole: where this is a share of a batch, what turns its mean KL into the whole batch's,
-        whose clip "mean" means
     """
     assert post_logits.shape == prior_logits.shape, (post_logits.shape, prior_logits.shape)
     assert error.shape == post_logits.shape[:2], (error.shape, post_logits.shape)
+    if free_nats_mode not in ("mean", "element"):
+        raise unknown_name("free_nats_mode", free_nats_mode, ("mean", "element"))
     error = error.mean()
     dyn = kl_one_hot(post_logits.detach(), prior_logits)
     rep = kl_one_hot(post_logits, prior_logits.detach())
-    if free_nats_mode not in ("mean", "element"):
-        raise unknown_name("free_nats_mode", free_nats_mode, ("mean", "element"))
     if free_nats_mode == "mean":
-        dyn, rep = dyn.mean(), rep.mean()
-        if whole is not None:  # the value of the whole, the gradient of the share
-            others = whole(dyn.detach()) - dyn.detach()
-            dyn, rep = dyn + others, rep + others
+        dyn = dyn.mean()
+        rep = rep.mean()
     kl = dyn.mean().detach()
-    dyn, rep = dyn.clamp_min(free_nats).mean(), rep.clamp_min(free_nats).mean()
+    dyn = dyn.clamp_min(free_nats).mean()
+    rep = rep.clamp_min(free_nats).mean()
     return WorldModelLoss(error + dyn_scale * dyn + rep_scale * rep, error, kl)
 
 
 def reward_loss(logits: Tensor, reward: Tensor, known: Tensor) -> Tensor:
     """-ln p_xi(r_t | s_t), averaged over the steps whose reward is known (A.3, Algorithm 1).
 
-    :param logits: (B, T, bins) of the reward head on detached features
+    :param logits: (B, T, bins), the reward head's output on detached features
     :param reward: (B, T)
     :param known: (B, T) bool
     """
@@ -94,10 +89,11 @@ def reward_loss(logits: Tensor, reward: Tensor, known: Tensor) -> Tensor:
 
 
 class WorldModel(nn.Module):
-    """Encoder, RSSM, decoder, and the reward head that fine-tuning adds.
+    """Encoder, RSSM, decoder, and the reward head, which only fine-tuning trains.
 
     :param size: the widths
     :param action_dim: the padded action width
+    :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start the reward head at zero, as DreamerV3 does
     """
 
@@ -108,61 +104,56 @@ class WorldModel(nn.Module):
         self.encoder = Encoder(size.depth)
         self.rssm = RSSM(size, action_dim, self.encoder.embed_dim, unimix)
         self.decoder = Decoder(size)
-        self.size, self.zero_init_heads = size, zero_init_heads
+        self.size = size
+        self.zero_init_heads = zero_init_heads
         self.reset_reward_head()
 
     def reset_reward_head(self) -> None:
-        """Draws the reward head anew: rewards belong to a task, the rest does not."""
+        """Draw new weights for the reward head: rewards belong to a task, the rest does not."""
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
-        """All of theta: everything but the reward head."""
+        """Return theta: the parameters of everything but the reward head."""
         return [p for part in (self.encoder, self.rssm, self.decoder) for p in part.parameters()]
 
+    @torch.no_grad()
     def standardise(self, image: Tensor) -> None:
         """Adapt the initial posterior to images of the data: (N, 64, 64, 3) uint8."""
-        with torch.no_grad():
-            self.rssm.standardise(self.encoder(image).float())
+        self.rssm.standardise(self.encoder(image).float())
 
-    def observe(
-        self, batch: Batch, generator: Generator | None = None
-    ) -> tuple[Latent, Tensor, Tensor]:
-        """Posterior Latent (B, T, ...), post_logits and prior_logits (B, T, S, K) of a batch."""
+    def observe(self, batch: Batch, generator: Noise = None) -> tuple[Latent, Tensor, Tensor]:
+        """Filter a batch: posterior Latent (B, T, ...), post_logits, prior_logits (B, T, S, K)."""
         embed = self.encoder(batch.image)
         return self.rssm.observe(embed, batch.action, batch.is_first, generator=generator)
 
     def decode(self, latent: Latent) -> Tensor:
         """(B, T, ...) -> (B, T, 64, 64, 3), about -0.5 .. 0.5."""
         flat = latent.flatten_time()
-        return self.decoder(flat.deter, flat.stoch).unflatten(0, latent.deter.shape[:2])
+        images: Tensor = self.decoder(flat.deter, flat.stoch)
+        return images.view(*latent.deter.shape[:2], *images.shape[1:])
 
     def reconstruction_error(self, latent: Latent, image: Tensor) -> Tensor:
-        """`squared_error(to_unit(image), self.decode(latent))`: (B, T), of (B, T, 64, 64, 3) uint8.
+        """`squared_error(to_unit(image), self.decode(latent))`, (B, T).
 
-        The decoded pixels are never put in the order of an image, nor on a CPU all images held at
-        once.
+        :param latent: (B, T, ...)
+        :param image: (B, T, 64, 64, 3) uint8
         """
-        flat, decoder = latent.flatten_time(), self.decoder
-
-        def error(image: Tensor, code: Tensor) -> Tensor:
-            return squared_error(to_unit(by_parity(image)), decoder.parities(code))
-
-        code = decoder.code(flat.deter, flat.stoch)
-        errors = in_pieces(error, decoder.largest, image.flatten(0, 1), code)
-        return errors.unflatten(0, image.shape[:2])
+        error = reconstruction_error(self.decoder, latent.flatten_time(), image.flatten(0, 1))
+        return error.view(image.shape[:2])
 
     def reward(self, feat: Tensor) -> Tensor:
-        """The reward that came with arriving in a state: (..., D + S*K) -> (...)."""
+        """Predict the reward for arriving in a state: (..., D + S*K) -> (...)."""
         return two_hot_mean(self.reward_head(feat))
 
     @torch.no_grad()
-    def open_loop(self, batch: Batch, context: int, generator: Generator | None = None) -> Tensor:
-        """Filters `context` images, then predicts the rest from the actions alone.
+    def open_loop(self, batch: Batch, context: int, generator: Noise = None) -> Tensor:
+        """Filter `context` images, then predict the rest from the actions alone.
 
         :return: (B, T, 64, 64, 3) uint8; the first `context` are reconstructions
         """
         embed = self.encoder(batch.image[:, :context])
-        action, is_first = batch.action, batch.is_first
+        action = batch.action
+        is_first = batch.is_first
         post, _, _ = self.rssm.observe(
             embed, action[:, :context], is_first[:, :context], generator=generator
         )
@@ -171,14 +162,15 @@ class WorldModel(nn.Module):
         last = Latent(post.deter[:, -1], post.stoch[:, -1])
         horizon = action.shape[1] - context
         dream, _ = self.rssm.imagine(last, lambda _, t: action[:, context + t], horizon, generator)
+        # the dream's first state is the last filtered one
         states = Latent(*(torch.cat([p, d[:, 1:]], 1) for p, d in zip(post, dream, strict=True)))
         return to_uint8(self.decode(states))
 
 
 def world_model_update_loss(
-    model: WorldModel, batch: Batch, generator: Generator | None = None, **options: Any
+    model: WorldModel, batch: Batch, generator: Noise = None, **options: Any
 ) -> tuple[WorldModelLoss, Latent]:
-    """Eq. (1) on a batch, and the posterior states it went through.
+    """Return Eq. (1) on a batch, and the batch's posterior states.
 
     :param options: the keywords of `world_model_loss`
     """

@@ -20,8 +20,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.distributions import Share, kl_one_hot
-from wpt_agents.model.networks import frozen
-from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_update_loss
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_loss
 
 T = TypeVar("T")
 PATIENCE = timedelta(days=1)  # the others wait while rank 0 collects or converts data
@@ -208,7 +208,7 @@ class Divided:
 
     @torch.no_grad()
     def _whole_kl(self, parts: list[Batch], seed: int) -> Callable[[Tensor], Tensor]:
-        """The keyword `whole` of `world_model_loss`.
+        """Return a function that turns a part's mean KL into the whole batch's.
 
         The first of several passes needs to know the KL of all, which costs each part one more way
         through encoder and RSSM.
@@ -225,7 +225,7 @@ class Divided:
 
 
 class _Objective(nn.Module):
-    """Eq. (1) as a forward pass, which is what DistributedDataParallel accompanies."""
+    """Eq. (1) of a part of a batch, as the forward pass that DistributedDataParallel needs."""
 
     def __init__(self, model: WorldModel, options: dict[str, Any]) -> None:
         super().__init__()
@@ -234,4 +234,20 @@ class _Objective(nn.Module):
     def forward(
         self, batch: Batch, draws: Share, whole: Callable[[Tensor], Tensor]
     ) -> WorldModelLoss:
-        return world_model_update_loss(self.model, batch, draws, whole=whole, **self.options)[0]
+        post, post_logits, prior_logits = self.model.observe(batch, draws)
+        error = self.model.reconstruction_error(post, batch.image)
+        options = dict(self.options)
+        if options["free_nats_mode"] == "mean":
+            kl = kl_one_hot(post_logits, prior_logits).mean().detach()
+            options["free_nats"] = part_free_nats(options["free_nats"], kl, whole(kl))
+        return world_model_loss(error, post_logits, prior_logits, **options)
+
+
+def part_free_nats(free_nats: float, part_kl: Tensor, whole_kl: Tensor) -> Tensor:
+    """Return the free nats that clip the mean KL of a part where the whole batch's is clipped.
+
+    With f free nats, Eq. (1) takes max(f, kl) of the whole batch's KL. A part with the KL k takes
+    max(f + k - kl, k) = max(f, kl) + k - kl instead: it is clipped exactly where the whole is, and
+    as the mean of all k is kl, the mean over all parts is max(f, kl).
+    """
+    return free_nats + part_kl - whole_kl

@@ -3,17 +3,16 @@
 `WPT` inherits `Updates`, so that `wpt.py` holds the algorithm and this module its gradient steps.
 """
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
-from torch.autograd.graph import increment_version
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 
+import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer, mix
 from wpt_agents.data.trajectory import Batch
@@ -26,9 +25,10 @@ from wpt_agents.model.actor_critic import (
     return_range,
 )
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, recent_frames
-from wpt_agents.model.networks import PIECE, find_size, frozen
+from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
-from wpt_agents.model.rssm import Latent
+from wpt_agents.model.rssm import Latent, over_steps
+from wpt_agents.model.sizes import find_size
 from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
 from wpt_agents.training.guidance import Schedule
 
@@ -121,17 +121,17 @@ class Updates:
         generator = self._generator(UPDATE, self.updates)
         post = self._update_world_model(batch, metrics, generator, learn_reward=True)
         imitation = self._imitation(post, batch, metrics)
-        self.starts = self._draw_starts(generator)
+        self.starts = self._draw_starts(batch, generator)
         start = post.flatten_time().pick(self.starts)
         self._update_behavior(start, metrics, generator, imitation)
 
-    def _draw_starts(self, generator: Generator) -> Tensor:
+    def _draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
         """Return the numbers of the batch's states to imagine from."""
         number = self.imagine_starts
         if number is None:
             number = self.policy.size.imagine_starts
-        shape = self.batch_size, self.batch_length
-        return draw_starts(*shape, number, generator, self.device)
+        rows, length = batch.is_first.shape
+        return draw_starts(rows, length, number, generator, self.device)
 
     def _update_world_model(
         self,
@@ -264,8 +264,7 @@ class Updates:
                 "them, and look at the data or lower the learning rate"
             )
         optimizer.step()
-        for weights in groups:  # fused steps do not, and `FastStep` looks at it
-            increment_version(weights)
+        self.policy.updates += 1  # cached copies of the weights are out of date
         return norms[0]
 
     def _autocast(self) -> AbstractContextManager[None]:
@@ -280,17 +279,6 @@ class Updates:
     def _generator(self, purpose: int, counter: int) -> Generator:
         seed = torch_seed(self._stream(purpose, counter))
         return Generator(self.device).manual_seed(seed)
-
-
-def over_steps(head: Callable[[Tensor], Tensor], states: Latent) -> Tensor:
-    """What a head makes of the features of N states at H steps: (N, H, ...).
-
-    All at once, or on a CPU step by step where that is too large: see `networks.in_pieces`.
-    """
-    deter, stoch = states
-    if deter.device.type != "cpu" or deter.numel() + stoch.numel() <= PIECE:
-        return head(states.feat)
-    return torch.stack([head(state.feat) for state in states.steps()], 1)
 
 
 def note(metrics: dict[str, list[Tensor]], loss: WorldModelLoss, norm: Tensor) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from wpt_agents.model.policy import WPTPolicy
+from wpt_agents.model.ops import definitions
 from wpt_agents.zoo.bench.model import agent, count
 from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds_in_turn
 
@@ -15,7 +15,7 @@ from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds_in_turn
 def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
     """A row a size, number of environments and form; params are those that acting uses.
 
-    The definition, `WPTPolicy.step`, and on a CPU the quick form of it take turns.
+    The definitions and their faster twins take turns.
     """
     torch.set_num_threads(threads)
     sizes, counts = (("debug",), (1,)) if quick else (("tiny", "small", "medium"), (1, 4, 16))
@@ -28,7 +28,7 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
             act = partial(policy.act, image, state, first)
             forms: dict[str, Callable[[], Any]] = {
                 "policy step": act,
-                "policy step, by definition": partial(defined, policy, act),
+                "policy step, by definition": partial(by_definition, act),
             }
             repetitions, warmup = (3, 1) if quick else (200, 20)
             times = seconds_in_turn(list(forms.values()), repetitions, warmup)
@@ -46,10 +46,7 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
                 }
 
 
-def defined(policy: WPTPolicy, act: Callable[[], Any]) -> None:
-    """Acts by `WPTPolicy.step`."""
-    policy._stepper = lambda: policy.step  # type: ignore[method-assign]
-    try:
+def by_definition(act: Callable[[], Any]) -> None:
+    """Act without any faster twin."""
+    with definitions():
         act()
-    finally:
-        del policy._stepper

@@ -5,17 +5,16 @@ import gc
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from wpt_agents.model.networks import FromPixel, UpConv, by_parity, convolved
+from wpt_agents.fast.products import product_by_convolution
+from wpt_agents.model.ops import definitions
 
 SIDE = 1024  # of the matrices whose product is the ceiling
 MATMULS = 5  # in a row, so that a turn of them takes about a tenth of a second
@@ -60,7 +59,7 @@ def _wait() -> None:
 def matmul(device: str = "cpu") -> Callable[[], Any]:
     """`MATMULS` products of two square matrices by torch: what is called the ceiling.
 
-    On AMD's CPUs with AVX-512 it is none: see `networks.by_convolution`, and `onednn`.
+    On AMD's CPUs with AVX-512 it is none: see `wpt_agents.fast.products`, and `onednn`.
     """
     a, b = (torch.randn(SIDE, SIDE).to(device) for _ in range(2))
     return lambda: [a @ b for _ in range(MATMULS)]
@@ -69,7 +68,7 @@ def matmul(device: str = "cpu") -> Callable[[], Any]:
 def onednn() -> Callable[[], Any]:
     """The same products as convolutions, which are oneDNN's on a CPU."""
     a, b = (torch.randn(SIDE, SIDE) for _ in range(2))
-    return lambda: [convolved(a, b) for _ in range(MATMULS)]
+    return lambda: [product_by_convolution(a, b) for _ in range(MATMULS)]
 
 
 def matmul_gflop() -> float:
@@ -80,13 +79,13 @@ def matmul_gflop() -> float:
 def gflop(step: Callable[[], Any]) -> float:
     """The multiplications and additions of one call, forward and backward, in units of 1e9.
 
-    A transposed convolution and a product of matrices count as what they are, not as the
-    convolutions that compute them here; what is not matmul or convolution counts nothing.
+    Operations are counted as they are defined, not as the convolutions and products that compute
+    them faster. What is neither a product of matrices nor a convolution counts nothing.
     """
     counter = FlopCounterMode(display=False)
     # its own walks through the modules, some of which mind
     counter.mod_tracker = _Everything()  # type: ignore[assignment]
-    with _by_definition(), counter:
+    with definitions(), counter:
         step()
     return counter.get_total_flops() / 1e9
 
@@ -95,25 +94,6 @@ class _Everything(nullcontext):
     """Counts for the whole and for no module by itself."""
 
     parents = ("Global",)
-
-
-def plain(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
-    """An `UpConv` by torch's own operator, as on a GPU."""
-    return nn.functional.conv_transpose2d(x, layer.weight, layer.bias, stride=2)
-
-
-@contextmanager
-def _by_definition() -> Iterator[None]:
-    def parities(layer: nn.ConvTranspose2d, x: torch.Tensor) -> torch.Tensor:
-        return by_parity(plain(layer, x).permute(0, 2, 3, 1))
-
-    with (
-        patch.object(UpConv, "forward", plain),
-        patch.object(UpConv, "parities", parities),
-        patch.object(FromPixel, "forward", plain),
-        patch("wpt_agents.model.networks.by_convolution", lambda *_: False),
-    ):
-        yield
 
 
 def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from typing import Any
-from unittest.mock import patch
 
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from wpt_agents.model.networks import UpConv
+from wpt_agents.model.ops import definitions
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
-from wpt_agents.zoo.bench.timing import gflop, plain
+from wpt_agents.zoo.bench.timing import gflop
 
 BATCH, LENGTH = 16, 64  # the work is told for these, counted on less and multiplied
 COUNTED = 1, 4
@@ -37,14 +36,9 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def _calls(length: int) -> dict[str, int]:
-    """The operators' calls on the way that a GPU takes, with the scan as a loop in autograd."""
+    """The operators' calls by the definitions, which is nearly the way that a GPU takes."""
     model, data = agent("debug"), synthetic_batch(1, length)
-    rssm = model.policy.world_model.rssm
-    rssm._scan = rssm._filter  # type: ignore[method-assign]
-    with (
-        patch.object(UpConv, "forward", plain),
-        patch("wpt_agents.model.networks.by_convolution", lambda *_: False),
-    ):
+    with definitions():
         return {
             "world model": launches(world_model_step(model, data)),
             "whole update": launches(whole_step(model, data)),

@@ -19,7 +19,7 @@ from zoo_command import call
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import promises
-from wpt_agents.zoo.judge.trained import find_trained
+from wpt_agents.zoo.judge.trained import Origin, find_trained
 from wpt_agents.zoo.report.hub import card, pull, push
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run.runner import run
@@ -56,7 +56,9 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     model = shutil.copy(folder / "model.zip", tmp_path / "alone.zip")
     words = ["--task", "dmc-dot", "--episodes", "1"]
     assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
-    monkeypatch.setattr("wpt_agents.zoo.judge.trained._config", lambda _: {"env": SECTIONS["env"]})
+    monkeypatch.setattr(
+        "wpt_agents.zoo.judge.trained.read_origin", lambda _: Origin("", SECTIONS["env"])
+    )
     assert call(monkeypatch, "eval", model, *words) == 0
 
 

@@ -117,7 +117,8 @@ def diagnose(
     :raises ValueError: an episode that is not longer than `horizon`
     """
     model = trained.load(device=device)
-    assert isinstance(model, WPT)
+    if not isinstance(model, WPT):
+        raise ValueError(f"{trained.model} has no world model: diagnose takes runs of WPT")
     low, high = model.action_space.low, model.action_space.high
     returns, errors, found = list[float](), list[float](), list[list[Promise]]()
     with closing(gym.make(trained.task, **trained.env)) as env:

@@ -149,11 +149,11 @@ def film(
     :param wrap: what the policy needs around its environment
     :return: the episode, its frames at `size`, and the frame rate that makes it real time
     """
-    filmed = gym.make(task, render_mode="rgb_array", render_size=size, **env)
+    made = gym.make(task, render_mode="rgb_array", render_size=size, **env)
+    filmed = Remembering(made)
     single: VecEnv = DummyVecEnv([lambda: filmed])
     act = acting(policy)
     frames: list[np.ndarray] = []
-    images: list[np.ndarray] = []
     actions: list[np.ndarray] = []
     rewards: list[float] = []
     with closing(wrap(single) if wrap else single) as venv:
@@ -163,14 +163,26 @@ def film(
         done = False
         while not done:
             frames.append(np.asarray(filmed.render()))
-            images.append(obs[0, ..., -3:])  # of stacked images, the newest
             actions.append(np.asarray(act(obs[0], {}, len(actions)), np.float32))
             obs, reward, dones, (info,) = venv.step(actions[-1][None])
             rewards.append(reward[0])
             done = bool(dones[0])
-        images.append(info["terminal_observation"][..., -3:])
+    images = filmed.images[:-1]  # without the image of the reset after the end
     terminated = not info["TimeLimit.truncated"]
     trajectory = Trajectory(
         np.stack(images), np.stack(actions), np.array(rewards, np.float32), terminated
     )
-    return trajectory, frames, float(filmed.metadata.get("render_fps", 25))
+    return trajectory, frames, float(made.metadata.get("render_fps", 25))
+
+
+class Remembering(gym.ObservationWrapper):
+    """Keeps every image that the environment shows, whatever is wrapped around it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.images: list[np.ndarray] = []
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Keep the image and pass it on."""
+        self.images.append(observation)
+        return observation

@@ -44,7 +44,8 @@ class Method:
         None for all, as WPT does
     :param policy: the first argument of the agent
     :param plus: whether the preset's section `plus` applies: what we add to the paper's algorithm
-    :param wrap: what the agent puts around its environments, e.g. a stack of frames
+    :param wrap: what the agent needs around its environments; SB3's agents with several frames need
+        `VecTransposeImage(VecFrameStack(venv, n))`
     """
 
     agent: type[BaseAlgorithm] = WPT
@@ -68,7 +69,7 @@ class Method:
 
     def takes(self, keyword: str) -> bool:
         """Return whether the agent's constructor has this keyword."""
-        return keyword in inspect.signature(self.agent.__init__).parameters
+        return keyword in inspect.signature(self.agent).parameters
 
 
 @cache
@@ -76,7 +77,7 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
     """Return the keywords of an agent that a preset or a method may set, with their defaults."""
     return {
         name: parameter.default
-        for name, parameter in inspect.signature(agent.__init__).parameters.items()
+        for name, parameter in inspect.signature(agent).parameters.items()
         if name not in RESERVED and not name.startswith("_")
     }
 

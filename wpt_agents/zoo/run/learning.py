@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,8 @@ def make_agent(
         "episode_length": episode_steps(run.task.id, run.shared.env),
     }
     known = {name: value for name, value in task.items() if method.takes(name)}
-    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **run.keywords, **known}
+    own = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
+    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **own, **known}
     agent: Any = without_progress_bar(method.agent)
     if checkpoint is not None:
         return agent.load(checkpoint.model, env=venv, **keywords)

@@ -43,11 +43,11 @@ def labels(episodes):
 
 
 def test_folders_name_the_robots_of_dmcontrol_and_the_tasks_of_metaworld(published):
-    found = open_episodes(published / "dmcontrol", image_size=8)
-    assert isinstance(found, OfficialEpisodes)
-    assert labels(found) == [("acrobot", None)] * 2 + [("walker", None)] * 2
-    found = open_episodes(published / "metaworld", image_size=8)
-    assert labels(found) == [("sawyer", "door-open")] * 2 + [("sawyer", "reach")] * 2
+    episodes = open_episodes(published / "dmcontrol", image_size=8)
+    assert isinstance(episodes, OfficialEpisodes)
+    assert labels(episodes) == [("acrobot", None)] * 2 + [("walker", None)] * 2
+    episodes = open_episodes(published / "metaworld", image_size=8)
+    assert labels(episodes) == [("sawyer", "door-open")] * 2 + [("sawyer", "reach")] * 2
 
 
 def test_both_suites_and_single_folders_are_recognised_too(published, monkeypatch):
@@ -61,8 +61,8 @@ def test_both_suites_and_single_folders_are_recognised_too(published, monkeypatc
 
 
 def test_a_label_that_is_asked_for_comes_before_the_folders(published):
-    found = open_episodes(published / "dmcontrol" / "walker", embodiment="biped", image_size=8)
-    assert labels(found) == [("biped", None)] * 2
+    episodes = open_episodes(published / "dmcontrol" / "walker", embodiment="biped", image_size=8)
+    assert labels(episodes) == [("biped", None)] * 2
 
 
 def test_actions_are_shifted_back_and_clipped(tmp_path):

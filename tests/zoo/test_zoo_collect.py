@@ -15,7 +15,7 @@ from wpt_agents.zoo.collect import collection as module
 from wpt_agents.zoo.collect.behaviours import COLOURS, coloured_noise, noise_actions
 from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.curious import Expedition, explore
-from wpt_agents.zoo.collect.episodes import record
+from wpt_agents.zoo.collect.episodes import Recipe, record
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -367,10 +367,10 @@ def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypat
     )
     with pytest.raises(StopIteration):
         call(monkeypatch, "collect", "--suite", "metaworld", "--out", tmp_path)
-    [((_, tasks, episodes, seed, _, behaviour, _), more)] = asked
-    assert (len(tasks), episodes, seed, behaviour) == (50, 1000, 0, "scripted")
-    plan = episodes.Recipe(sigmas=tuple(more["sigmas"]))
-    count = Counter(plan.sigma(episode) for episode in range(episodes))
+    [((_, tasks, number, seed, _, behaviour, _), more)] = asked
+    assert (len(tasks), number, seed, behaviour) == (50, 1000, 0, "scripted")
+    plan = Recipe(sigmas=tuple(more["sigmas"]))
+    count = Counter(plan.sigma(episode) for episode in range(number))
     assert count == {0.1: 200, 0.3: 200, 0.5: 200, 1.0: 200, 2.0: 200}
     assert not more["rewards"]
 

@@ -22,11 +22,12 @@ from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for ea
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
-from wpt_agents.zoo.run import locks, runner
+from wpt_agents.zoo.run import learning, locks, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.run.runner import run
+from wpt_agents.zoo.run.shared import collect_data, pretrain
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
@@ -54,7 +55,7 @@ class KillAt(LearningBar):
 def killed_at(step, monkeypatch, one):
     """Does the run until `step`, and no more."""
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "LearningBar", lambda _: KillAt(step))
+        patch.setattr(learning, "LearningBar", lambda _: KillAt(step))
         with pytest.raises(Killed):
             run(one)
 
@@ -102,7 +103,7 @@ def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch,
 def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):
     one = job(tmp_path, **CHANGES)
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+        patch.setattr(runner, "evaluate_policies", lambda *_: (_ for _ in ()).throw(Killed))
         with pytest.raises(Killed):
             run(one)
     before = weights(WPT.load(one.folder / "model.zip"))
@@ -171,7 +172,7 @@ def test_leftovers_of_checkpoints_that_cannot_be_used_make_way(tmp_path, monkeyp
     one = job(tmp_path, **CHANGES)
     killed_at(110, monkeypatch, one)
     (one.folder / "replay" / "episode-000000.zip").unlink()
-    with pytest.warns(UserWarning, match="damaged and passed over"):
+    with pytest.warns(UserWarning, match="damaged and was skipped"):
         killed_at(30, monkeypatch, one)
     assert [p.name for p in (one.folder / "checkpoints").iterdir()] == ["step-000000025"]
     assert len(list((one.folder / "replay").iterdir())) == 1
@@ -181,7 +182,7 @@ def test_the_checkpoint_at_the_end_is_not_written_twice(tmp_path, monkeypatch):
     one, written = job(tmp_path, learn={"frames": 150, "checkpoint_every": 0}), []
     for _ in range(2):
         with monkeypatch.context() as patch:
-            patch.setattr(runner, "_evaluate", lambda *_: (_ for _ in ()).throw(Killed))
+            patch.setattr(runner, "evaluate_policies", lambda *_: (_ for _ in ()).throw(Killed))
             with pytest.raises(Killed):
                 run(one)
         (state,) = one.folder.glob("checkpoints/*/state.json")
@@ -201,7 +202,7 @@ def test_training_and_evaluation_share_no_episode(tmp_path):
 
 def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monkeypatch):
     shared = job(tmp_path).shared
-    dataset, folder = shared.data(), shared.model_path
+    dataset, folder = collect_data(shared), shared.model_path
 
     def other():
         with locked(folder / "lock"):
@@ -213,14 +214,14 @@ def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monk
     thread.start()
     begun.wait()
     monkeypatch.setattr(WPT, "pretrain", lambda *_, **__: pytest.fail("pre-trained twice"))
-    assert shared.model(dataset) == folder / "model.zip"
+    assert pretrain(shared, dataset) == folder / "model.zip"
     thread.join()
 
 
 def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monkeypatch):
     monkeypatch.setattr("wpt_agents.training.pretraining.EVERY", 100)
     shared, update = job(tmp_path, pretrain={"steps": 300}).shared, WPT._update_world_model
-    dataset, taken = shared.data(), []
+    dataset, taken = collect_data(shared), []
 
     def dying(*args):
         taken.append(0)
@@ -231,9 +232,9 @@ def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(WPT, "_update_world_model", dying)
         with pytest.raises(Killed):
-            shared.model(dataset)
+            pretrain(shared, dataset)
     assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 3
-    shared.model(dataset)
+    pretrain(shared, dataset)
     assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 6
 
 

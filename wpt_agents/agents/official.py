@@ -63,11 +63,11 @@ def import_model(
 
 def check_shapes(policy: WPTPolicy, tensors: dict[str, Tensor], path: Path) -> None:
     """Refuse a tensor of another shape than the policy's."""
-    for name, own in policy.state_dict().items():
-        if name in tensors and tensors[name].shape != own.shape:
+    for name, weight in policy.state_dict().items():
+        if name in tensors and tensors[name].shape != weight.shape:
             raise ValueError(
                 f"The tensors of {path} do not fit together: {official_name(name)} has the shape "
-                f"{tuple(tensors[name].shape)}, but the others ask for {tuple(own.shape)}"
+                f"{tuple(tensors[name].shape)}, but the others ask for {tuple(weight.shape)}"
             )
 
 

@@ -56,5 +56,5 @@ def is_official(folder: str | os.PathLike[str]) -> bool:
 def _below_suite(folder: Path) -> list[str]:
     """The names on the way down to `folder`, from the last one that is a suite's."""
     parts = Path(os.path.abspath(folder)).parts
-    found = [i for i, part in enumerate(parts) if part in SUITES]
-    return list(parts[found[-1] :]) if found else []
+    suites = [i for i, part in enumerate(parts) if part in SUITES]
+    return list(parts[suites[-1] :]) if suites else []

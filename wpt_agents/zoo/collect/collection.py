@@ -10,23 +10,24 @@ import os
 import shutil
 import zlib
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm.auto import tqdm
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import unknown_name
 from wpt_agents.training.checks import check_hyperparameters
 from wpt_agents.zoo.collect.curious import Expedition, explore_each
 from wpt_agents.zoo.collect.episodes import (
     SIGMAS,
+    STATE_CURIOSITY,
     Job,
     Recipe,
     has_script,
@@ -35,11 +36,15 @@ from wpt_agents.zoo.collect.episodes import (
     robot_of,
 )
 from wpt_agents.zoo.collect.policies import load_policy
+from wpt_agents.zoo.collect.state_curiosity import STAGES, write_stages
 from wpt_agents.zoo.collect.workers import worker_pool
+from wpt_agents.zoo.plan.presets import EXPLORATION_KEYWORDS
 from wpt_agents.zoo.terminal import progress
 
-BEHAVIOURS = ("random", "noise", "scripted", "policy", *EXPLORERS)
+BEHAVIOURS = ("random", "noise", "scripted", "policy", STATE_CURIOSITY, *EXPLORERS)
 EPISODES_A_JOB = 4
+Work = TypeVar("Work")
+Result = TypeVar("Result")
 
 
 def collect(
@@ -66,17 +71,19 @@ def collect(
     :param tasks: ids for `gymnasium.make`
     :param behaviour: "noise", of random colour and strength; "random", uniform; "scripted",
         Meta-World's scripts with noise, elsewhere "noise"; "policy", a saved one with noise; "icm"
-        or "plan2explore", a curious agent for each task
+        or "plan2explore", a curious agent for each task, which learns from pixels;
+        "explore-state", one that learns from the simulator's state, at five stages of its training
     :param env: keyword arguments of `gymnasium.make`
     :param rewards: store the rewards, too
     :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, in turn
         by episode
     :param policy: a WPT model file, or one of SB3's as "sac:expert.zip"; takes images, or states
         where the environment tells them
-    :param settings: keywords of WPT for a curious agent, beside `exploration.EXPLORE`
+    :param settings: keywords of WPT for a curious agent, beside `curious.EXPLORE`; `steps` of
+        "explore-state"
     """
     _check(tasks, episodes, behaviour, policy)
-    check_hyperparameters({**EXPLORE, **(settings or {})})
+    _check_settings(behaviour, settings or {})
     recipe = Recipe(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
@@ -92,11 +99,35 @@ def collect(
     label, gather = f"collect {behaviour}", _collect_played
     if behaviour in EXPLORERS:
         gather = _collect_curious
+    if behaviour == STATE_CURIOSITY:
+        gather = _collect_state_curious
     with dataset:
         dataset.reserve()  # before what is missing is counted
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
             gather(dataset, tasks, episodes, recipe, workers, bar)
     return TrajectoryDataset.open(path)
+
+
+def _collect_state_curious(
+    dataset: TrajectoryDataset,
+    tasks: Sequence[str],
+    episodes: int,
+    recipe: Recipe,
+    workers: int,
+    bar: "tqdm[None]",
+) -> None:
+    """Explore each task by its state, then record the stages of the exploration as pixels."""
+    left = [t for at, t in enumerate(tasks) if _done(dataset, at, episodes) < episodes]
+    write = partial(
+        write_stages, dataset.path, env=recipe.env, seed=recipe.seed, settings=recipe.settings
+    )
+    for _ in _in_order(write, left, workers):
+        bar.refresh()
+    _collect_played(
+        dataset, tasks, episodes, replace(recipe, stages=str(dataset.path)), workers, bar
+    )
+    for folder in dataset.path.glob("exploring-*"):
+        shutil.rmtree(folder)
 
 
 def _collect_played(
@@ -112,7 +143,7 @@ def _collect_played(
         for at, task in enumerate(tasks)
         for first in range(_done(dataset, at, episodes), episodes, EPISODES_A_JOB)
     ]
-    for trajectories in _played(jobs, workers):
+    for trajectories in _in_order(play, jobs, workers):
         for trajectory in trajectories:
             dataset.append(trajectory)
         dataset.flush()
@@ -177,6 +208,17 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
         load_policy(policy)  # says what is wrong with it
 
 
+def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
+    if behaviour != STATE_CURIOSITY:
+        check_hyperparameters({**EXPLORE, **settings})
+        return
+    for name, value in settings.items():
+        if name not in EXPLORATION_KEYWORDS:
+            raise unknown_name("setting of explore-state", name, EXPLORATION_KEYWORDS)
+        if not isinstance(value, int) or value < STAGES:
+            raise ValueError(f"steps must be a whole number of at least {STAGES}, got {value!r}")
+
+
 def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     """The dataset to append to: a new one, or the one that the same call began."""
     label = path / "collect.json"
@@ -203,16 +245,18 @@ def _read_label(file: Path) -> dict[str, Any]:
         ) from error
 
 
-def _played(jobs: Sequence[Job], workers: int) -> Iterator[list[Trajectory]]:
-    """The results of the jobs in their order, at most two a worker ahead of the reader."""
+def _in_order(
+    function: Callable[[Work], Result], jobs: Sequence[Work], workers: int
+) -> Iterator[Result]:
+    """Yield the results in the jobs' order, at most two per worker ahead of the reader."""
     if workers < 2 or len(jobs) < 2:
-        yield from map(play, jobs)
+        yield from map(function, jobs)
         return
     with worker_pool(workers) as pool:
-        ahead: deque[Future[list[Trajectory]]] = deque()
+        ahead: deque[Future[Result]] = deque()
         try:
             for job in jobs:
-                ahead.append(pool.submit(play, job))
+                ahead.append(pool.submit(function, job))
                 if len(ahead) >= 2 * workers:
                     yield ahead.popleft().result()
             while ahead:

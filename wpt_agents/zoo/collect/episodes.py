@@ -17,7 +17,9 @@ from gymnasium import spaces
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
+from wpt_agents.zoo.collect.state_curiosity import STAGES, stage_files, state_policy
 
+STATE_CURIOSITY = "explore-state"  # the behaviour of `state_curiosity`
 SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
 
 
@@ -50,6 +52,7 @@ class Recipe:
     :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
     :param policy: a saved policy, see `wpt_agents.zoo.collect.policies.load_policy`
     :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
+    :param stages: the folder with the stages of an exploration by state, played in turn by episode
     """
 
     seed: int = 0
@@ -59,6 +62,7 @@ class Recipe:
     sigmas: tuple[float, ...] = SIGMAS
     policy: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    stages: str | None = None
 
     def label(self) -> dict[str, Any]:
         """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
@@ -93,6 +97,7 @@ def make_env(task: str, recipe: Recipe) -> gym.Env:
     """The task with actions in [-1, 1], telling its state to those who need it."""
     told = recipe.behaviour == "scripted" and has_script(task)
     told = told or (recipe.policy is not None and sees_states(recipe.policy))
+    told = told or recipe.stages is not None
     env = gym.make(task, **recipe.env, **({"state_in_info": True} if told else {}))
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
@@ -120,6 +125,11 @@ def _actions(
         sigma = recipe.sigma(episode)
         name = f"policy {Path(recipe.policy).name}, sigma {sigma}"
         return SavedPolicy(rng, recipe.policy, sigma, width), name
+    if recipe.stages is not None:
+        stage = episode % STAGES
+        explorer = state_policy(stage_files(Path(recipe.stages), task)[stage].read_bytes())
+        name = f"curiosity on the state, stage {stage + 1} of {STAGES}"
+        return lambda obs, info, step: explorer(info["state"], rng), name
     if recipe.behaviour == "random":
         return random_actions(rng, width, MAX_STEPS)
     if recipe.behaviour == "scripted" and has_script(task):

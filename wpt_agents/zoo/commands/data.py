@@ -44,8 +44,8 @@ def collect_data(
     behaviour: Annotated[
         str,
         typer.Option(
-            help="noise, random, scripted (Meta-World), policy, icm or plan2explore. None: "
-            "scripted in metaworld, elsewhere noise."
+            help="What plays: noise, random, scripted (Meta-World), policy, explore-state, icm or "
+            "plan2explore. By default scripted in metaworld and noise elsewhere."
         ),
     ] = "",
     sigma: Annotated[
@@ -57,7 +57,11 @@ def collect_data(
     rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
     settings: Annotated[
         list[str],
-        typer.Option("--set", metavar="KEY=VALUE", help="For icm, plan2explore: WPT's keywords."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Keywords of WPT for icm and plan2explore; steps=N for explore-state.",
+        ),
     ] = [],  # noqa: B006
     rendering: Annotated[Rendering, typer.Option(help="Of the pictures.")] = Rendering.near,
 ) -> None:
@@ -69,7 +73,12 @@ def collect_data(
     Example: `python -m wpt_agents.zoo collect --tasks walker-run --behaviour icm --out data`
     """
     from wpt_agents.zoo.collect.collection import collect
-    from wpt_agents.zoo.plan.presets import keywords, load_preset, suite_names
+    from wpt_agents.zoo.plan.presets import (
+        EXPLORATION_KEYWORDS,
+        keywords,
+        load_preset,
+        suite_names,
+    )
     from wpt_agents.zoo.tasks import find_tasks
 
     paper = load_preset(suite, "paper").collect if suite in suite_names() else None
@@ -77,9 +86,10 @@ def collect_data(
     ids = [row.id for row in find_tasks(suite, names)]
     episodes = episodes or (paper.episodes if paper else 30)
     behaviour = behaviour or (paper.behaviour if paper else "noise")
+    valid = EXPLORATION_KEYWORDS if behaviour == "explore-state" else None
     dataset = collect(
         out, ids, episodes, seed, workers, behaviour, {"rendering": str(rendering)},
-        rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings),
+        rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings, valid),
     )  # fmt: skip
     _print_summary(dataset)
 

@@ -1,7 +1,7 @@
 """What a run is to do: zoo/<suite>.yaml, read, merged and checked before any work begins."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Self, get_type_hints
@@ -11,6 +11,8 @@ import yaml
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.plan.methods import defaults
+
+EXPLORATION_KEYWORDS = ("steps",)  # of `collect --behaviour explore-state`
 
 
 @dataclass(frozen=True)
@@ -224,13 +226,18 @@ def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
     return Preset.of(given)
 
 
-def keywords(settings: Sequence[str]) -> dict[str, Any]:
-    """Keywords of WPT from "key=value" each, every name valid, or ValueError."""
+def keywords(settings: Sequence[str], valid: Collection[str] | None = None) -> dict[str, Any]:
+    """Return keywords from "key=value" each.
+
+    :param valid: their names; those of WPT if None
+    :raises ValueError: another name
+    """
+    names = wpt_keywords() if valid is None else valid
     given: dict[str, Any] = {}
     for title, section in (pair for text in settings for pair in _setting(text).items()):
         for name in section:
-            if title != "wpt" or name not in wpt_keywords():
-                raise unknown_name("WPT keyword", name, wpt_keywords())
+            if title != "wpt" or name not in names:
+                raise unknown_name("keyword for --set", name, names)
         given |= section
     return given
 
@@ -241,7 +248,7 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
     if not equals or not key.strip():
         raise ValueError(f"--set wants key=value, got {text!r}.")
     title, dot, key = key.strip().rpartition(".")
-    if not dot and key not in wpt_keywords():
+    if not dot and key not in {*wpt_keywords(), *EXPLORATION_KEYWORDS}:
         sections = get_type_hints(Preset)
         dotted = {
             f"{t}.{k}" for t, s in sections.items() if is_dataclass(s) for k in get_type_hints(s)

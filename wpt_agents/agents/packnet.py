@@ -1,0 +1,244 @@
+"""PackNet (Mallya and Lazebnik, 2018): one network for a sequence of tasks, by pruning.
+
+Source: https://arxiv.org/abs/1711.05769, with the equal shares and the frozen biases of Continual
+World (https://arxiv.org/abs/2105.10919). After each task the smallest weights are freed for the
+tasks to come, and the others are trained a little more and then never changed again.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import torch
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from wpt_agents.agents.drqv2 import Critic, DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
+from wpt_agents.agents.frame_agent import FrameProgress
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.model.frames import orthogonal
+from wpt_agents.training.keywords import Stage, count, share
+from wpt_agents.training.randomness import Purpose
+
+FREE = -1  # the owner of weights that the present task trains
+
+
+def prune(weight: Tensor, owner: Tensor, task: int, tasks_left: int) -> Tensor:
+    """Give the largest free weights to a task: a share of 1 / (tasks_left + 1) of them.
+
+    All tasks of a sequence get equally many weights of each layer, up to rounding.
+
+    :param weight: of one layer
+    :param owner: the task that owns each weight, or FREE
+    :param tasks_left: tasks that come after this one
+    :return: the owners afterwards
+    """
+    free = (owner == FREE).flatten().nonzero().squeeze(1)
+    kept = round(len(free) / (tasks_left + 1))
+    order = weight.detach().abs().flatten()[free].argsort(descending=True, stable=True)
+    after = owner.clone()
+    after.view(-1)[free[order[:kept]]] = task
+    return after
+
+
+class PackNetPolicy(DrQv2Policy):
+    """DrQ-v2's networks with an owner for each weight of the encoder and the actor.
+
+    Layer norms and biases have no owners; they are frozen when the first task ends. The critic
+    serves the present task only.
+    """
+
+    def build(self) -> None:
+        """Draw the networks; all weights are free."""
+        super().build()
+        for name, weight in self.managed():
+            self.register_buffer(_owner(name), torch.full(weight.shape, FREE, dtype=torch.int8))
+
+    def managed(self) -> Iterator[tuple[str, Tensor]]:
+        """The weights that have owners: convolutions and linear layers of encoder and actor."""
+        for part in ("encoder", "actor"):
+            for name, module in getattr(self, part).named_modules():
+                if isinstance(module, nn.Conv2d | nn.Linear):
+                    yield f"{part}.{name}.weight", module.weight
+
+    def owner(self, name: str) -> Tensor:
+        """The task that owns each weight of a layer, or FREE."""
+        return self.get_buffer(_owner(name))
+
+    def freeze_rest(self) -> None:
+        """Freeze the biases and layer norms of encoder and actor."""
+        managed = {id(weight) for _, weight in self.managed()}
+        for parameter in (*self.encoder.parameters(), *self.actor.parameters()):
+            parameter.requires_grad_(id(parameter) in managed)
+
+    @torch.no_grad()
+    def prune(self, task: int, tasks_left: int) -> None:
+        """Give the largest free weights to a task and set the others to zero."""
+        for name, weight in self.managed():
+            owner = self.owner(name)
+            owner.copy_(prune(weight, owner, task, tasks_left))
+            weight[owner == FREE] = 0
+
+    @torch.no_grad()
+    def redraw(self) -> None:
+        """Draw the free weights and the critic again, for the next task."""
+        fresh = dict(deepcopy(self).apply(orthogonal).managed())
+        for name, weight in self.managed():
+            free = self.owner(name) == FREE
+            weight[free] = fresh[name][free]
+        _, features, hidden = self.widths
+        shape = self.encoder.embed_dim, features, hidden, self.action_dim
+        self.critic = Critic(*shape).apply(orthogonal).to(self.device)
+        self.target_critic = deepcopy(self.critic).requires_grad_(False)
+
+    @torch.no_grad()
+    def as_task(self, task: int) -> "PackNetPolicy":
+        """Return a copy that acts as it did at the end of a task: later weights are zero."""
+        policy = deepcopy(self)
+        for name, weight in policy.managed():
+            owner = policy.owner(name)
+            weight[(owner == FREE) | (owner > task)] = 0
+        return policy
+
+
+def _owner(name: str) -> str:
+    return "owner_" + name.replace(".", "_")  # buffers' names have no dots
+
+
+class PackNetLearner(DrQv2Learner):
+    """The update of DrQ-v2 that changes no weight of another owner. Adam begins anew.
+
+    With moments of its own from before, Adam would move a weight whose gradient is zero.
+
+    :param trains: the owner whose weights are trained: FREE, or a task that is being retrained
+    """
+
+    policy: PackNetPolicy
+
+    def __init__(self, policy: PackNetPolicy, given: DrQv2Keywords, trains: int = FREE) -> None:
+        super().__init__(policy, given)
+        self.hooks = [
+            weight.register_hook(partial(_masked, policy, name, trains))
+            for name, weight in policy.managed()
+        ]
+
+    def close(self) -> None:
+        """Stop masking gradients, before another learner of the same policy is made."""
+        for hook in self.hooks:
+            hook.remove()
+
+
+def _masked(policy: PackNetPolicy, name: str, trains: int, gradient: Tensor) -> Tensor:
+    return gradient * (policy.owner(name) == trains)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackNetKeywords(DrQv2Keywords):
+    """The keywords of `PackNet`."""
+
+    tasks: int = count(6, "tasks in the sequence; each gets an equal share of the weights")
+    retrain: float = share(
+        0.1, "updates after the pruning, as a share of the task's own", Stage.TASK
+    )
+
+
+@dataclass(kw_only=True)
+class PackNetProgress(FrameProgress):
+    """How far an agent has come in its sequence of tasks.
+
+    :ivar task: the present task's number, from 0 on
+    :ivar updates_before: updates that were made for earlier tasks
+    """
+
+    task: int = 0
+    updates_before: int = 0
+
+
+class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
+    """DrQ-v2 on a sequence of tasks, whose weights are shared out by pruning.
+
+    Example::
+
+        model = PackNet("CnnPolicy", "wpt/dmc-quadruped-stand-v0", tasks=2)
+        model.learn(150_000)
+        model.next_task("wpt/dmc-quadruped-walk-v0")
+        model.learn(150_000)
+        model.policy_of(0).predict(obs)  # still stands
+
+    :param policy: "CnnPolicy"
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": PackNetPolicy}
+    saved_as = "PackNet"
+    policy: PackNetPolicy
+    learner: PackNetLearner
+    hyperparameters: PackNetKeywords
+    progress: PackNetProgress
+
+    def make_policy(self) -> PackNetPolicy:
+        """Make the networks, as wide as the environment's actions."""
+        given = self.hyperparameters
+        widths = given.channels, given.feature_dim, given.hidden_dim
+        return PackNetPolicy(self.observation_space, self.action_space, None, *widths)
+
+    def make_learner(self) -> PackNetLearner:
+        """Make the optimisers, and mask the gradients of weights that earlier tasks own."""
+        return self._learner_of(FREE)
+
+    def _learner_of(self, trains: int) -> PackNetLearner:
+        before = getattr(self, "learner", None)
+        if isinstance(before, PackNetLearner):
+            before.close()
+        return PackNetLearner(self.policy, self.hyperparameters, trains)
+
+    def restore(self, about: Mapping[str, Any], *args: Any) -> None:
+        """Take over a model file; in a later task biases and layer norms are frozen."""
+        if about["counters"]["task"]:
+            self.policy.freeze_rest()
+            self.learner = self.make_learner()  # its optimisers leave out what is frozen
+        super().restore(about, *args)
+
+    def policy_of(self, task: int) -> PackNetPolicy:
+        """Return the policy of a task up to the present one, as it was when the task ended."""
+        return self.policy if task == self.progress.task else self.policy.as_task(task)
+
+    def next_task(self, env: Any, progress_bar: bool = False) -> None:
+        """Prune and retrain the weights of the present task, then begin another one.
+
+        What was collected is dropped, since another task pays other rewards.
+
+        :raises ValueError: the sequence has no further task, or the actions have another width
+        """
+        tasks_left = self.hyperparameters.tasks - 1 - self.progress.task
+        if tasks_left < 1:
+            raise ValueError(f"tasks={self.hyperparameters.tasks}: there is no further task")
+        checked = self._checked(env)
+        if checked.action_space.shape != self.action_space.shape:
+            raise ValueError(
+                f"The tasks of a sequence have actions of one width, here {self.action_space.shape}"
+                f" and {checked.action_space.shape}"
+            )
+        self.policy.prune(self.progress.task, tasks_left)
+        self.policy.freeze_rest()
+        self._retrain(progress_bar)
+        with torch.random.fork_rng():
+            torch.manual_seed(self.streams.integer(Purpose.REDRAW, self.progress.task))
+            self.policy.redraw()
+        self.replay_buffer = ReplayBuffer()
+        self.progress.reset("credit", "seen_length")
+        self.progress.task += 1
+        self.progress.updates_before = self.updates
+        self.learner = self.make_learner()
+        self._use_env(checked)
+
+    def _retrain(self, progress_bar: bool) -> None:
+        """Train the weights that the present task keeps, from its replay."""
+        self.learner = self._learner_of(self.progress.task)
+        own = self.updates - self.progress.updates_before
+        updates = round(own * self.hyperparameters.retrain)
+        for _ in tqdm(range(updates), desc="retrain", disable=not progress_bar):
+            self.update(defaultdict(list))

@@ -1,0 +1,99 @@
+"""Losses of DreamerV3 (https://arxiv.org/abs/2301.04104) that the paper does not use.
+
+Each is behind a keyword of WPT that is off by default: `actor_grad="reinforce"`, `repval_scale`,
+and the continue head, which is used where the data hold a termination.
+
+Our rewards come with arriving in a state: V_t contains r_t, which the action at step t did not
+cause. The return of that action is therefore γ V_{t+1}, and its baseline v_t - r_t.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from wpt_agents.model.distributions import two_hot_loss
+
+
+def advantage(
+    reward: Tensor, value: Tensor, lambda_return: Tensor, discount: Tensor | float
+) -> Tensor:
+    """A_t = r_t + γ V_{t+1} - v_t: how much better an action was than the critic expects.
+
+    :param reward: (N, H), on arriving at the imagined steps 0 .. H-1
+    :param value: (N, H + 1), the critic's means at the steps 0 .. H
+    :param lambda_return: (N, H), V of Eq. (2)
+    :param discount: γ, or (N, H) γ times the probability that the episode goes on at step t + 1
+    :return: (N, H - 1), of the actions at the steps 0 .. H-2; no gradient runs through it
+    """
+    if isinstance(discount, Tensor):
+        discount = discount[:, :-1]
+    later = discount * lambda_return[:, 1:]
+    return (reward[:, :-1] + later - value[:, :-2]).detach()
+
+
+def reinforce_loss(
+    log_prob: Tensor,
+    advantage: Tensor,
+    entropy: Tensor,
+    weight: Tensor,
+    ent_coef: float = 3e-4,
+    return_scale: Tensor | float = 1.0,
+) -> Tensor:
+    """DreamerV3's Eq. (11): -A_t / S ln π(a_t | s_t) - η H[a_t | s_t], step t weighing γ^t.
+
+    :param log_prob: (N, H - 1), of the actions taken, as constants
+    :param advantage: (N, H - 1)
+    :param entropy: (N, H - 1)
+    :param weight: (H - 1,) or (N, H - 1), the discounts γ^t
+    :param return_scale: S, what returns are divided by
+    """
+    assert log_prob.shape == advantage.shape == entropy.shape, (log_prob.shape, entropy.shape)
+    objective = log_prob * (advantage / return_scale) + ent_coef * entropy
+    return -(weight * objective).mean()
+
+
+def replay_return(
+    reward: Tensor,
+    bootstrap: Tensor,
+    is_last: Tensor,
+    is_terminal: Tensor,
+    gamma: float = 0.99,
+    lam: float = 0.95,
+) -> Tensor:
+    """λ-returns of replayed steps: V_t = r_t + γ [(1 - λ) b_{t+1} + λ V_{t+1}].
+
+    :param reward: (B, T), on arriving in each replayed state
+    :param bootstrap: (B, T), b_t, the imagined return of a dream from each state
+    :param is_last: (B, T) bool, the next state belongs to another episode
+    :param is_terminal: (B, T) bool, the episode ended here and nothing follows
+    :return: (B, T); the last step of a sequence or an episode is its bootstrap
+    """
+    assert reward.shape == bootstrap.shape == is_last.shape == is_terminal.shape, reward.shape
+    returns = [torch.where(is_terminal[:, -1], reward[:, -1], bootstrap[:, -1])]
+    for t in reversed(range(reward.shape[1] - 1)):
+        after = (1 - lam) * bootstrap[:, t + 1] + lam * returns[-1]
+        value = torch.where(is_last[:, t], bootstrap[:, t], reward[:, t] + gamma * after)
+        returns.append(torch.where(is_terminal[:, t], reward[:, t], value))
+    return torch.stack(returns[::-1], 1)
+
+
+def replay_value_loss(logits: Tensor, replay_return: Tensor, known: Tensor) -> Tensor:
+    """DreamerV3's replay value loss: -ln v(V_t | s_t) where the rewards are known.
+
+    It holds the critic to returns that were earned, where dreams may promise too much.
+
+    :param logits: (B, T, bins) of the critic on detached replayed states
+    :param replay_return: (B, T); no gradient reaches it
+    :param known: (B, T) bool
+    """
+    loss = two_hot_loss(logits, replay_return.detach())
+    return (loss * known).sum() / known.sum().clamp_min(1)
+
+
+def continue_loss(logits: Tensor, is_terminal: Tensor) -> Tensor:
+    """-ln p(c_t | s_t) of a Bernoulli: whether the episode goes on after this state.
+
+    :param logits: (B, T), of going on, on detached features
+    :param is_terminal: (B, T) bool
+    """
+    return F.binary_cross_entropy_with_logits(logits.float(), (~is_terminal).float())

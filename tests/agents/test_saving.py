@@ -178,7 +178,7 @@ def test_the_replay_file_is_whole_or_refused(learnt, tmp_path):
 # -------------------------------------------------------------------------- nothing is lost
 
 
-@pytest.mark.parametrize("where", [(archive.os, "fsync"), (model_file, "save_tensors")])
+@pytest.mark.parametrize("where", [(archive.os, "fsync"), (model_file, "write_tensors")])
 def test_a_failing_write_keeps_the_old_file(tmp_path, monkeypatch, where):
     old, new = agent(), agent(seed=1)
     old.save(tmp_path / "model.zip")

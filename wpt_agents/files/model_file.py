@@ -8,18 +8,16 @@ from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.optim import Optimizer
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.files.tensors import read_tensors, write_tensors
 
 KIND, VERSION = "wpt_agents model", 1
 ABOUT, TENSORS = "about.json", ".safetensors"
-FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, SafetensorError, EOFError, OSError)
-FAULTS += (KeyError, RuntimeError, TypeError, ValueError)  # so fail zipfile and json on nonsense
+FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, EOFError, OSError, KeyError)
+FAULTS += (AttributeError, RuntimeError, TypeError, ValueError)  # of zipfile and json on nonsense
 
 
 def write_model(
@@ -43,8 +41,8 @@ def _write(
         head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **about}
         archive.writestr(zipfile.ZipInfo(ABOUT), json.dumps(head, indent=1))
         for name, group in tensors.items():
-            whole = {key: tensor.detach().cpu().contiguous() for key, tensor in group.items()}
-            archive.writestr(zipfile.ZipInfo(name + TENSORS), save_tensors(whole))
+            with archive.open(zipfile.ZipInfo(name + TENSORS), "w", force_zip64=True) as member:
+                write_tensors(member, group)
 
 
 def read_model(
@@ -74,12 +72,17 @@ def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, di
                 raise ValueError(f"it is of version {about['version']}: update wpt_agents")
             if about.get("groups", groups) != groups:
                 raise ValueError(f"it should hold {about['groups']} and holds {groups}")
-            return about, {n: load_tensors(archive.read(n + TENSORS)) for n in groups}
+            return about, {name: _tensors(archive, name) for name in groups}
     except FAULTS as error:
         raise ValueError(
             f"{name} is no {KIND} of version {VERSION}, or is damaged ({error}); "
             "load another copy or an earlier checkpoint"
         ) from error
+
+
+def _tensors(archive: zipfile.ZipFile, group: str) -> dict[str, Tensor]:
+    with archive.open(group + TENSORS) as member:
+        return read_tensors(member, archive.getinfo(group + TENSORS).file_size)
 
 
 def _members(archive: zipfile.ZipFile) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import wpt_envs
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
@@ -23,6 +24,7 @@ from wpt_agents.zoo.judge.prediction import (
     dream,
     windows,
 )
+from wpt_agents.zoo.judge.probes import probe as probes
 
 FOLDER = Path("runs") / "bench" / "prediction"
 DMC = ("walker-run", "cheetah-run", "cartpole-swingup", "quadruped-run")
@@ -70,10 +72,14 @@ QUICK = Plan(
 )
 
 
-def rows(quick: bool = False, updates: int | None = None) -> Iterator[dict[str, Any]]:
-    """A row for each robot and way of predicting; draws `prediction.png` and `strips.png`.
+def rows(
+    quick: bool = False, updates: int | None = None, probe: bool = False
+) -> Iterator[dict[str, Any]]:
+    """Yield a row for each robot and way of predicting; draw `prediction.png` and `strips.png`.
 
-    :param updates: of each world model, if not the plan's; more of them go on from fewer
+    :param updates: of each world model, if not the plan's; more of them continue from fewer
+    :param probe: yield instead how well linear probes read the true state from the latents of the
+        generalist and of each robot's specialist
     """
     plan = QUICK if quick else FULL
     if updates is not None:
@@ -84,6 +90,9 @@ def rows(quick: bool = False, updates: int | None = None) -> Iterator[dict[str, 
         env=LOOK,
     )  # fmt: skip
     dataset, held_out = split(data, plan)
+    if probe:
+        yield from probes_of(plan, dataset)
+        return
     ways = predictors(plan, dataset)
     tests = {
         robot: [windows(t, plan.windows, plan.model["max_action_dim"]) for t in of(held_out, robot)]
@@ -94,6 +103,19 @@ def rows(quick: bool = False, updates: int | None = None) -> Iterator[dict[str, 
     at = list(ways).index(LEFT_OUT) + 1
     shown.insert(at, (f"{LEFT_OUT}, left out", LEFT_OUT, unseen))
     yield from compare(ways, tests, plan.folder, shown, LEFT_OUT)
+
+
+def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]]:
+    """Yield the probes of an untrained model, of the generalist and of the robot's specialist."""
+    untrained = WPT("WPTPolicy", seed=0, **plan.model)
+    generalist = train(plan, "generalist", dataset, plan.updates)
+    for task in plan.tasks:
+        robot = wpt_envs.TASKS[task].embodiment
+        specialist = train(plan, f"specialist-{robot}", of(dataset, robot), plan.updates)
+        models = {"untrained": untrained, "generalist": generalist, "specialist": specialist}
+        for name, model in models.items():
+            for row in probes(model, [task], episodes=2 * plan.held_out):
+                yield {"model": name, "updates": model.pretrain_steps, **row}
 
 
 def split(data: TrajectoryDataset, plan: Plan) -> tuple[TrajectoryDataset, TrajectoryDataset]:

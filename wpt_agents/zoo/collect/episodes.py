@@ -86,11 +86,10 @@ class Job:
 
 
 def play(job: Job) -> list[Trajectory]:
-    """The episodes of a job: a function of the job alone."""
-    with closing(make_env(job.task, job.recipe)) as env, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")  # scripts ask for more
+    """Play the episodes of a job; they depend on the job alone."""
+    with closing(make_env(job.task, job.recipe)) as env:
         episodes = range(job.first, job.first + job.count)
-        return [_play_episode(env, job, episode) for episode in episodes]
+        return [play_episode(env, job, episode) for episode in episodes]
 
 
 def make_env(task: str, recipe: Recipe) -> gym.Env:
@@ -98,13 +97,14 @@ def make_env(task: str, recipe: Recipe) -> gym.Env:
     told = recipe.behaviour == "scripted" and has_script(task)
     told = told or (recipe.policy is not None and sees_states(recipe.policy))
     told = told or recipe.stages is not None
-    env = gym.make(task, **recipe.env, **({"state_in_info": True} if told else {}))
+    env = gym.make(task, **{**recipe.env, **({"state_in_info": True} if told else {})})
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return env
 
 
-def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
+def play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
+    """Play the episode of this number; it depends on job and number alone."""
     recipe = job.recipe
     task = zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
     source = np.random.SeedSequence([recipe.seed, task, episode])
@@ -112,7 +112,9 @@ def _play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
     act, name = _actions(
         np.random.default_rng(source), job.task, recipe, episode, env.action_space.shape[0]
     )
-    played = record(env, act, int(source.generate_state(1)[0]))
+    with warnings.catch_warnings():  # some of Meta-World's scripts ask for more than they can have
+        warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")
+        played = record(env, act, int(source.generate_state(1)[0]))
     reward = played.reward if recipe.rewards else None
     return replace(played, reward=reward, embodiment=robot_of(job.task), task=job.task, source=name)
 

@@ -44,6 +44,14 @@ def bench(
     updates: Annotated[
         int | None, typer.Option(min=1, help="Of each model, in the case prediction.")
     ] = None,
+    probe: Annotated[
+        bool,
+        typer.Option(
+            "--probe",
+            help="In the case prediction, show instead how well linear probes read the true state "
+            "from the latents.",
+        ),
+    ] = False,
 ) -> None:
     """Measures speed on this machine: medians after a warm-up.
 
@@ -59,7 +67,10 @@ def bench(
         raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
     if compiled and (peer or case != Case.model):
         raise ValueError("--compile goes with bench model, and not with --peer")
+    if probe and case != Case.prediction:
+        raise ValueError(f"--probe goes with bench prediction, not with bench {case}")
     options: dict[str, Any] = {
+        "probe": probe,
         "quick": quick,
         "compiled": compiled,
         "threads": threads,

@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import get_system_info, safe_mean
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from wpt_agents.agents.attributes import declare
@@ -47,13 +47,16 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.model_file import read_model
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.actions import space_as_dict, space_from_dict
 from wpt_agents.model.policy import IMAGE_SPACE, to_images
 from wpt_agents.training import model_files
-from wpt_agents.training.checks import check_rewards, check_spaces
+from wpt_agents.training.checks import check_device, check_rewards
+from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.keywords import Keywords, Stage
 from wpt_agents.training.progress import Progress
 from wpt_agents.training.randomness import Purpose, Streams, torch_seed
 from wpt_agents.training.rollout import Rollout, Window, last_images, step_all
+from wpt_agents.training.spaces import check_spaces
 
 Metrics = dict[str, list[Tensor]]
 
@@ -116,6 +119,7 @@ class PixelAgent(BaseAlgorithm):
     ) -> None:
         if unknown := keywords.keys() - self.keywords.declared().keys():
             raise TypeError(str(unknown_name("keyword", min(unknown), self.keywords.declared())))
+        check_device(device)
         self.hyperparameters = self.keywords(**keywords)
         self.progress = self.progress_class()
         seed = self.hyperparameters.seed
@@ -255,15 +259,11 @@ class PixelAgent(BaseAlgorithm):
         super().set_random_seed(seed)
 
     @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        before = env if isinstance(env, VecEnv) else None
-        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if wrapped is not before and isinstance(wrapped, VecTransposeImage):
-            return wrapped.venv  # images stay (H, W, 3) until the networks
-        return wrapped
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return as_vec_env(env, monitor=monitor_wrapper)
 
     def _checked(self, env: GymEnv | str) -> VecEnv:
-        wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
+        wrapped = self._wrap_env(env, self.verbose)
         self.check_env(wrapped)
         return wrapped
 
@@ -363,7 +363,8 @@ class PixelAgent(BaseAlgorithm):
             self.num_timesteps += self.n_envs
             if self.num_timesteps > self.hyperparameters.learning_starts:
                 self.credit += self.n_envs
-            finished = rollout.end_step(rewards, dones, last_images(infos, dones))
+            last = last_images(self.env, infos, dones, new_obs)
+            finished = rollout.end_step(rewards, dones, last)
             self._store(finished)  # before the callback, which may save the replay buffer
             callback.update_locals(locals())
             go_on = callback.on_step()
@@ -453,11 +454,10 @@ class PixelAgent(BaseAlgorithm):
         :param exclude: accepted because SB3 has it; nothing optional is in the file
         :param include: likewise
         """
-        space = self.action_space
         about = {
             "class": self.saved_as,
             "hyperparameters": self.hyperparameters.as_dict(),
-            "action_space": {"low": space.low.tolist(), "high": space.high.tolist()},
+            "action_space": space_as_dict(self.action_space),
             "dataset": str(self.dataset.path) if self.dataset is not None else None,
             "counters": self.progress.as_dict(),
         }
@@ -497,8 +497,7 @@ class PixelAgent(BaseAlgorithm):
         agent = cls(
             device=device, _init_setup_model=False, **{**about["hyperparameters"], **kwargs}
         )
-        low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
-        agent.action_space = spaces.Box(low, high)
+        agent.action_space = space_from_dict(about["action_space"])
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
         agent.restore(about, tensors, cls.shape_keywords)

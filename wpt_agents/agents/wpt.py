@@ -22,11 +22,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LinearLR
@@ -50,15 +50,17 @@ from wpt_agents.model.policy import (
 )
 from wpt_agents.training.checks import (
     check_dataset,
+    check_device,
     check_hyperparameters,
     check_rewards,
-    check_spaces,
     check_trajectory,
     plain,
 )
+from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.guidance import draw_window, ever, parse_schedule
 from wpt_agents.training.pretraining import Pretraining
 from wpt_agents.training.rollout import Rollout, last_images, step_all
+from wpt_agents.training.spaces import check_spaces
 from wpt_agents.training.updates import ACT, CLONE, RETRIEVE, WARMUP, WINDOW, torch_seed
 
 NO_DATASET = (
@@ -217,6 +219,7 @@ class WPT(Pretraining, BaseAlgorithm):
     ) -> None:
         given = {k: plain(v) for k, v in locals().items() if k in HYPERPARAMETERS}
         check_hyperparameters(given)
+        check_device(device)
         widths = find_size(size)
         self.hyperparameters = given = {**given, "size": plain_size(size)}
         for name, value in given.items():
@@ -340,12 +343,8 @@ class WPT(Pretraining, BaseAlgorithm):
         self.dataset = dataset
 
     @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        given = env if isinstance(env, VecEnv) else None
-        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if wrapped is not given and isinstance(wrapped, VecTransposeImage):
-            return wrapped.venv  # images stay (H, W, 3) until the networks
-        return wrapped
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return as_vec_env(env, monitor=monitor_wrapper)
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Takes another environment, with any number of copies and any allowed action width.
@@ -356,7 +355,7 @@ class WPT(Pretraining, BaseAlgorithm):
         :raises ValueError: observations that are no images, actions that are no bounded Box or
             are wider than `max_action_dim`
         """
-        wrapped = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
+        wrapped = self._wrap_env(env, self.verbose)
         check_spaces(wrapped, self.max_action_dim)
         assert isinstance(wrapped.action_space, spaces.Box)
         begun = self.episodes or self.retrieved_ids
@@ -513,7 +512,8 @@ class WPT(Pretraining, BaseAlgorithm):
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
             self.credit += self.n_envs
-            finished = rollout.end_step(rewards, dones, last_images(infos, dones))
+            last = last_images(self.env, infos, dones, new_obs)
+            finished = rollout.end_step(rewards, dones, last)
             for trajectory in finished:  # before the callback, which may save the replay buffer
                 for name, error in self.policy.heldout_errors(trajectory).items():
                     self.logger.record_mean(f"train/heldout_{name}_error", error)

@@ -9,9 +9,11 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import IMAGE_SIZE
+from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.model.networks import Size
-from wpt_agents.model.policy import State, stack_frames, to_images
+from wpt_agents.model.observations import Observation, to_images
+from wpt_agents.model.policy import State, stack_frames
 
 
 class FramePolicy(BasePolicy):
@@ -111,13 +113,11 @@ class FramePolicy(BasePolicy):
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
         """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's own action space."""
-        low, high = self.action_space.low, self.action_space.high
-        action = low + 0.5 * (action.clip(-1, 1) + 1) * (high - low)
-        return action.clip(low, high).astype(self.action_space.dtype)  # rounding may overstep
+        return to_bounds(action, self.action_space)
 
     def predict(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observation: Observation,
         state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,

@@ -10,12 +10,18 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
-from wpt_agents.data.images import resized
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
+from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.actor_critic import Actor, Critic
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.model.distributions import Noise
 from wpt_agents.model.layers import frozen
+from wpt_agents.model.observations import (
+    Observation,
+    check_episode_start,
+    check_state,
+    to_images,
+)
 from wpt_agents.model.ops import op
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.sizes import Size
@@ -32,27 +38,6 @@ class Dream(NamedTuple):
     action: Tensor  # (N, H, A)
     entropy: Tensor  # (N, H), of the actor at the steps 0 .. H-1
     saturated: Tensor  # scalar, the share of the actor's means beyond 0.99
-
-
-def to_images(observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarray, bool]:
-    """Convert observations to (n, 64, 64, 3) uint8, and return whether there was a batch axis.
-
-    :param observation: (H, W, 3) or (3, H, W), one or a batch; other sizes are resized
-    :raises ValueError: anything that is not a uint8 image
-    """
-    observation = np.asarray(observation)
-    batched = observation.ndim == 4
-    images = observation if batched else observation[None]
-    if images.ndim == 4 and images.shape[-1] != 3 and images.shape[1] == 3:
-        images = images.transpose(0, 2, 3, 1)
-    if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8:
-        raise ValueError(
-            f"An observation must be an image, (H, W, 3) uint8 or a batch of them, got "
-            f"{observation.shape} {observation.dtype}; render the environment to pixels"
-        )
-    if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
-        images = resized(images, IMAGE_SIZE)
-    return np.require(images, requirements=("C", "W")), batched
 
 
 class WPTPolicy(BasePolicy):
@@ -150,13 +135,11 @@ class WPTPolicy(BasePolicy):
         :return: action (n, A) in [-1, 1], zero in the padding, and the new state
         """
         n = len(image)
-        if state is not None and len(state[0]) != n:
-            raise ValueError(
-                f"The state is that of {len(state[0])} environments, but there are {n} "
-                "observations: pass state=None if all episodes begin"
-            )
-        *latent, action = (self._tensor(x) for x in state or self.initial_state(n))
-        first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
+        fresh = self.initial_state(n)
+        if state is not None:
+            check_state(state, tuple(part.shape[1:] for part in fresh), n)
+        *latent, action = (self._tensor(x) for x in state or fresh)
+        first = check_episode_start(episode_start, n)
         inputs = self._tensor(image), Latent(*latent), action, self._tensor(first)
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.actor.truncated(outputs, self.action_mask)
@@ -175,16 +158,11 @@ class WPTPolicy(BasePolicy):
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
         """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
-        low = self.action_space.low
-        high = self.action_space.high
-        action = action[:, : len(low)].clip(-1, 1)
-        action = low + 0.5 * (action + 1) * (high - low)
-        action = action.clip(low, high)  # rounding may overstep
-        return np.asarray(action, self.action_space.dtype)
+        return to_bounds(action, self.action_space)
 
     def predict(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observation: Observation,
         state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -320,7 +298,7 @@ class PriorPolicy:
 
     def predict(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observation: Observation,
         state: State | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -343,10 +321,10 @@ def stack_frames(
     """
     if frames is None:
         return np.repeat(image[:, None], FRAMES, 1)
+    check_state((frames,), ((FRAMES, *image.shape[1:]),), len(image))
+    first = check_episode_start(episode_start, len(image))
     moved = np.concatenate([frames[:, 1:], image[:, None]], 1)
-    if episode_start is not None:
-        first = np.asarray(episode_start, bool)
-        moved[first] = image[first, None]
+    moved[first] = image[first, None]
     return moved
 
 

@@ -1,21 +1,17 @@
 """Refusals: what WPT cannot act in or learn from, each naming what came and what would do."""
 
-import warnings
 from collections.abc import Collection, Mapping
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+import torch
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.networks import find_size
-
-IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
-
+from wpt_agents.training.spaces import IMAGE_SHAPE
 
 COUNTS = (  # keywords of WPT that count something there must be one of
     *("max_action_dim", "batch_size", "batch_length", "imagine_horizon"),
@@ -76,36 +72,18 @@ def check_hyperparameters(given: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 
 
-def check_spaces(env: VecEnv, max_action_dim: int | None = None) -> None:
-    """Refuse an environment that an agent cannot act in; warn where images will be resized.
-
-    :param max_action_dim: the largest number of actions, or None for any
-    """
-    image, action = env.observation_space, env.action_space
-    shape: tuple[int, ...] = getattr(image, "shape", None) or ()
-    is_image = isinstance(image, spaces.Box) and image.dtype == np.uint8 and len(shape) == 3
-    if not is_image or 3 not in (shape[0], shape[-1]):
+def check_device(device: torch.device | str) -> None:
+    """Refuses a device that torch cannot compute on here, instead of falling back to the CPU."""
+    if device == "auto":
+        return
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ValueError(
-            "The agent sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
-            f"are {image}: render it to pixels, e.g. with gymnasium's AddRenderObservation"
-        )
-    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
-        raise ValueError(
-            f"The agent acts in a one-dimensional Box, the environment takes {action}: wrap it so "
-            "that it takes continuous actions"
-        )
-    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
-        raise ValueError(
-            f"The action space must have finite bounds, it is {action}: wrap the environment "
-            "with gymnasium's RescaleAction or ClipAction"
-        )
-    if max_action_dim is not None and action.shape[0] > max_action_dim:
-        raise ValueError(
-            f"The environment has {action.shape[0]} actions, the model was made for at most "
-            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
-        )
-    if sorted(shape) != sorted(IMAGE_SHAPE):
-        warnings.warn(f"Observations of {shape} are resized to {IMAGE_SHAPE}", stacklevel=3)
+            f"device={str(device)!r} does not work here (torch {torch.__version__} finds "
+            f"{torch.cuda.device_count()} CUDA devices): give device='auto' or 'cpu', or install a "
+            "torch that was built for the device"
+        ) from error
 
 
 def check_images(dataset: TrajectoryDataset) -> None:

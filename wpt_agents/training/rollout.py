@@ -10,6 +10,7 @@ from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.policy import State, stack_frames, to_images
+from wpt_agents.training.environments import last_observation
 
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
@@ -153,12 +154,15 @@ def step_all(
 
 
 def last_images(
-    infos: list[dict[str, Any]], dones: np.ndarray
+    env: VecEnv | None, infos: list[dict[str, Any]], dones: np.ndarray, new_obs: Any
 ) -> dict[int, tuple[np.ndarray, bool]]:
-    """Return for each ended episode its last image and whether it terminated (no time limit)."""
+    """Return for each ended episode its last image and whether it terminated (no time limit).
+
+    :param new_obs: (n, ...), what the step returned: the first observations of new episodes
+    """
     return {
         int(i): (
-            to_images(infos[i]["terminal_observation"])[0][0],
+            to_images(last_observation(env, infos, i, new_obs[i]))[0][0],
             not infos[i].get("TimeLimit.truncated", False),
         )
         for i in np.flatnonzero(dones)

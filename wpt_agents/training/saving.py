@@ -10,7 +10,6 @@ from io import BufferedIOBase
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
@@ -21,6 +20,7 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.model_file import load_optimizer, optimizer_tensors, read_model, write_model
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.actions import space_as_dict, space_from_dict
 from wpt_agents.model.policy import WPTPolicy
 
 COUNTERS = (  # where a model stands, besides its weights
@@ -73,11 +73,10 @@ class Saving:
         """
         if isinstance(path, str | os.PathLike) and not Path(path).suffix:
             path = Path(path).with_suffix(".zip")
-        space = self.action_space
         about = {
             "class": self.saved_as,
             "hyperparameters": self.hyperparameters,
-            "action_space": {"low": space.low.tolist(), "high": space.high.tolist()},
+            "action_space": space_as_dict(self.action_space),
             "dataset": str(self.dataset.path) if self.dataset is not None else None,
             "counters": {name: getattr(self, name) for name in COUNTERS},
         }
@@ -119,8 +118,7 @@ class Saving:
                 f"{path} is of {kind}: read it by {kind}.load, not {cls.__name__}.load"
             )
         model: Self = cls(device=device, **{**about["hyperparameters"], **kwargs})
-        low, high = (np.array(about["action_space"][k], np.float32) for k in ("low", "high"))
-        model.action_space = spaces.Box(low, high)
+        model.action_space = space_from_dict(about["action_space"])
         model.policy.set_action_space(model.action_space)
         model._take(about, tensors, ("size", "max_action_dim"))
         if env is not None:

@@ -1,0 +1,348 @@
+"""The doors to `set_env`: ids, functions, lists, vectors of Gymnasium, foreign VecEnvs."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from debug_agent import ClockEnv, agent, noise, on_time
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.training.environments import as_vec_env
+
+FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+
+
+class Reusing(ClockEnv):
+    """The clock, always drawn into the same array."""
+
+    array = None
+
+    def render(self):
+        self.array = super().render() if self.array is None else self.array
+        self.array[:] = self.time
+        return self.array
+
+
+def learnt(env, steps=42):
+    return agent(env, learning_starts=0, train_ratio=4).learn(steps)
+
+
+def stored(model):
+    return model.replay_buffer.trajectories
+
+
+def all_on_time(model, count):
+    """Whether there are that many episodes of the clock, each image in its place."""
+    return len(stored(model)) == count and all(on_time(each) for each in stored(model))
+
+
+# ---------------------------------------------------------------------------- what is accepted
+
+
+@pytest.mark.parametrize(
+    ("door", "n_envs"),
+    [
+        (ClockEnv, 1),
+        (lambda: ClockEnv(), 1),
+        (ClockEnv(), 1),
+        (EnvSpec("Clock-v0", entry_point=ClockEnv, max_episode_steps=7), 1),
+        ([ClockEnv(), ClockEnv()], 2),
+        ((ClockEnv, ClockEnv, ClockEnv), 3),
+        (DummyVecEnv([ClockEnv, ClockEnv]), 2),
+        (make_vec_env(ClockEnv, n_envs=2), 2),
+    ],
+)
+def test_one_environment_or_several_are_taken_however_they_come(door, n_envs):
+    model = learnt(door)
+    assert model.n_envs == n_envs and all_on_time(model, 6)
+    assert len(model.ep_info_buffer) == 6 or isinstance(door, DummyVecEnv)
+
+
+@FORK
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize("terminates", [True, False])
+def test_vectors_of_gymnasium_store_every_image_in_its_place(kind, mode, terminates):
+    lengths = (7, 5)
+    vector = kind(
+        [lambda n=n: ClockEnv(n, terminates) for n in lengths], autoreset_mode=mode, copy=False
+    )
+    model = learnt(vector, 70)  # 35 of each: 5 episodes of 7, 7 of 5
+    model.get_env().close()
+    for length, count in zip(lengths, (5, 7), strict=True):
+        episodes = [each for each in stored(model) if len(each) == length]
+        assert len(episodes) == count and all(on_time(each, length) for each in episodes)
+    assert {each.terminated for each in stored(model)} == {terminates}
+    infos = [(each["l"], each["r"]) for each in model.ep_info_buffer]
+    assert set(infos) == {(7, 28.0), (5, 15.0)} and all(model.ep_success_buffer)
+
+
+def test_gyms_make_vec_is_taken_with_its_default_and_with_updates_meanwhile():
+    gym.register("Clock-v0", entry_point=ClockEnv, max_episode_steps=7)
+    vector = gym.make_vec("Clock-v0", num_envs=2, vectorization_mode="sync")
+    model = agent(vector, learning_starts=0, train_ratio=4, train_freq="step").learn(42)
+    del gym.registry["Clock-v0"]
+    assert all_on_time(model, 6) and model.updates > 10
+
+
+def test_the_seeds_of_a_vector_count_up_from_the_agents_own():
+    class Dice(ClockEnv):
+        def reset(self, *, seed=None, options=None):
+            self.seed = seed
+            return super().reset(seed=seed)
+
+    vector = SyncVectorEnv([Dice, Dice])
+    agent(vector, seed=5).learn(1)
+    assert [env.unwrapped.seed for env in vector.envs] == [5, 6]
+
+
+class Own(VectorEnv):
+    """A vector that steps two clocks by itself."""
+
+    def __init__(self, mode):
+        self.num_envs, self.clocks = 2, [ClockEnv(), ClockEnv()]
+        self.metadata = {} if mode is None else {"autoreset_mode": mode}
+        self.single_observation_space = ClockEnv.observation_space
+        self.single_action_space = self.clocks[0].action_space
+
+    def reset(self, *, seed=None, options=None):
+        return np.stack([clock.reset()[0] for clock in self.clocks]), {}
+
+    def step(self, actions):
+        steps = [clock.step(action) for clock, action in zip(self.clocks, actions, strict=True)]
+        image, reward, over, late, _ = map(np.stack, zip(*steps, strict=True))
+        if not late.any():
+            return image, reward, over, late, {}
+        return self.reset()[0], reward, over, late, {"final_obs": image}
+
+
+def test_somebodys_own_vector_is_taken_if_it_resets_in_the_same_step():
+    assert all_on_time(learnt(Own(AutoresetMode.SAME_STEP)), 6)
+    assert all_on_time(learnt(VectorWrapper(Own(AutoresetMode.SAME_STEP))), 6)
+    with pytest.raises(ValueError, match=r"Own resets in the step after .*SAME_STEP"):
+        agent(Own(AutoresetMode.NEXT_STEP))
+    with pytest.raises(ValueError, match=r"Own has no autoreset_mode.*SAME_STEP"):
+        agent(Own(None))
+
+
+@FORK
+def test_workers_without_shared_memory_are_taken_in_the_mode_that_the_refusal_names():
+    keywords = {"num_envs": 2, "vectorization_mode": "async"}
+    gym.register("Clock-v0", entry_point=ClockEnv, max_episode_steps=7)
+    vector = gym.make_vec("Clock-v0", **keywords, vector_kwargs={"shared_memory": False})
+    with pytest.raises(ValueError, match="not by a mask: make it with vector_kwargs") as refusal:
+        agent(vector)
+    vector.close()
+    line = str(refusal.value).split("make it with vector_kwargs=")[1]
+    options = eval(line, {"gymnasium": gym}) | {"shared_memory": False}
+    vector = gym.make_vec("Clock-v0", **keywords, vector_kwargs=options)
+    del gym.registry["Clock-v0"]
+    model = learnt(vector)
+    vector.close()
+    assert all_on_time(model, 6)
+
+
+# --------------------------------------------------------------------------- what is refused
+
+
+class Bare:
+    """A dm_env of nothing that Shimmy knows."""
+
+    def action_spec(self): ...
+
+    observation_spec = reset = step = action_spec
+
+
+@pytest.mark.parametrize(
+    ("door", "words"),
+    [
+        ([], "An empty list"),
+        ([env := ClockEnv(), env], r"same environment twice.*for _ in range\(4\)"),
+        ([ClockEnv(), ClockEnv(actions=3)], r"one action_space: number 0 has .* number 1"),
+        (3, "This int is no environment: give an id, a Gymnasium environment, a function"),
+        ({"env": ClockEnv()}, "This dict is no environment"),
+        (lambda: None, "This NoneType is no environment"),
+        (Bare(), "This Bare is a dm_env. Write a gymnasium.Env around it, as Shimmy"),
+    ],
+)
+def test_what_is_no_environment_is_refused_by_what_it_is(door, words):
+    with pytest.raises(ValueError, match=words):
+        agent(door)
+
+
+def test_a_bare_dm_env_is_refused_with_the_line_that_wraps_it():
+    import shimmy
+    import wpt_envs
+    from dm_control import suite
+
+    env = suite.load("cartpole", "balance")
+    with pytest.raises(ValueError, match=r"Environment is a dm_env\. Wrap") as refusal:
+        agent(env)
+    line = str(refusal.value).split("`env = ")[1].rstrip("`")
+    env = eval(line, {"wpt_envs": wpt_envs, "shimmy": shimmy, "env": env})
+    assert agent(env).learn(2).num_timesteps == 2
+    env.close()
+
+
+def test_an_id_of_ours_needs_no_import_and_a_strangers_says_which():
+    code = (
+        "import sys; from wpt_agents.training.environments import make; "
+        "assert 'wpt_envs' not in sys.modules; "
+        "print(make('wpt/dmc-cartpole-balance-v0').observation_space.shape)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.stdout.strip() == "(64, 64, 3)", run.stderr
+    with pytest.raises(gym.error.NamespaceNotFound, match="'package:nobody/Thing-v0'"):
+        agent("nobody/Thing-v0")
+    with pytest.raises(gym.error.NameNotFound, match="walker-run"):
+        agent("wpt/dmc-walker-rum-v0")
+
+
+# --------------------------------------------------------------------------- Dict observations
+
+
+class Cameras(ClockEnv):
+    """The clock as entries of a dictionary."""
+
+    def __init__(self, *names):
+        super().__init__()
+        boxes = {name: ClockEnv.observation_space for name in names}
+        self.observation_space = spaces.Dict(arm=spaces.Box(-1, 1, (7,)), **boxes)
+        self.names = names
+
+    def _seen(self, image):
+        images = {name: image + place for place, name in enumerate(self.names)}
+        return {"arm": np.zeros(7, np.float32), **images}
+
+    def reset(self, **kwargs):
+        image, info = super().reset(**kwargs)
+        return self._seen(image), info
+
+    def step(self, action):
+        image, *rest = super().step(action)
+        return self._seen(image), *rest
+
+
+@FORK
+@pytest.mark.filterwarnings("default:Of the Dict")
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda make: make(),
+        lambda make: DummyVecEnv([make, make]),
+        lambda make: SyncVectorEnv([make, make], autoreset_mode="SameStep"),
+        lambda make: AsyncVectorEnv([make, make]),
+    ],
+)
+def test_the_only_image_of_a_dictionary_is_seen_and_the_warning_names_it(wrap):
+    with pytest.warns(UserWarning, match="agent sees 'top', not 'arm'"):
+        model = learnt(wrap(lambda: Cameras("top")))
+    assert all_on_time(model, 6)
+    model.get_env().close()
+
+
+@pytest.mark.filterwarnings("ignore:Of the Dict", "ignore:Evaluation environment")
+def test_prediction_and_evaluation_take_the_dictionary_too():
+    model = learnt(Cameras("top"))
+    obs = Cameras("top").reset()[0]
+    one, _ = model.predict(obs, deterministic=True)
+    same, _ = model.predict(obs["top"], deterministic=True)
+    assert np.array_equal(one, same)
+    mean, _ = evaluate_policy(model, Monitor(Cameras("top")), 1)
+    assert mean == 28
+
+
+def test_of_several_images_one_is_to_be_chosen():
+    with pytest.raises(ValueError, match=r"2 images, 'top', 'wrist': choose .*image_key='top'"):
+        agent(Cameras("top", "wrist"))
+    vec_env = as_vec_env(Cameras("top", "wrist"), image_key="wrist")
+    assert (vec_env.reset() == 1).all()
+    with pytest.raises(ValueError, match=r"No entry 'side' .*There are: 'arm', 'top', 'wrist'"):
+        as_vec_env(Cameras("top", "wrist"), image_key="side")
+    with pytest.raises(ValueError, match="image_key='top' chooses from Dict observations"):
+        as_vec_env(ClockEnv(), image_key="top")
+
+
+# ------------------------------------------------------------------------------ foreign VecEnvs
+
+
+class Renamed(VecEnvWrapper):
+    """Reports the last observation by another name, or not at all."""
+
+    def __init__(self, venv, name):
+        super().__init__(venv)
+        self.name = name
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        for info in infos:
+            last = info.pop("terminal_observation", None)
+            if last is not None and self.name:
+                info[self.name] = last
+        return obs, rewards, dones, infos
+
+
+@pytest.mark.parametrize("name", ["final_obs", "final_observation"])
+def test_the_last_image_may_have_gymnasiums_names(name):
+    assert all_on_time(learnt(Renamed(DummyVecEnv([ClockEnv]), name)), 6)
+
+
+def test_a_vecenv_without_the_last_image_is_refused_by_name_and_nothing_is_stored():
+    model = agent(Renamed(DummyVecEnv([ClockEnv]), None))
+    with pytest.raises(ValueError, match=r"0 of the Renamed .*\['terminal_observation'\]"):
+        model.learn(20)
+    assert not stored(model)
+    model.set_env(Renamed(DummyVecEnv([ClockEnv]), "terminal_observation"))  # as it says
+    assert all_on_time(model.learn(42), 6)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda: Reusing(),
+        lambda: [Reusing(), Reusing()],
+        lambda: DummyVecEnv([Reusing, Reusing]),
+        lambda: Renamed(make_vec_env(Reusing, n_envs=2), "terminal_observation"),
+        lambda: SyncVectorEnv([Reusing, Reusing], autoreset_mode="SameStep"),
+        lambda: SyncVectorEnv([Reusing, Reusing], autoreset_mode="NextStep", copy=False),
+    ],
+)
+def test_an_environment_that_draws_into_one_array_keeps_its_last_images(wrap):
+    assert all_on_time(learnt(wrap()), 6)
+
+
+@FORK
+def test_in_another_process_such_an_environment_is_warned_of():
+    vec_env = SubprocVecEnv([Reusing], start_method="fork")
+    with pytest.warns(UserWarning, match=r"same image at the end .* return observation.copy\(\)"):
+        learnt(vec_env, 7)
+    vec_env.close()
+    vec_env = SubprocVecEnv([ClockEnv], start_method="fork")
+    assert all_on_time(learnt(vec_env, 14), 2)
+    vec_env.close()
+
+
+# --------------------------------------------------------------------------------------- device
+
+
+@pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="this machine has CUDA")
+@pytest.mark.parametrize("device", ["cuda", "cuda:1", "gpu", "xpu"])
+def test_a_device_that_does_not_work_is_refused_and_not_replaced(device, tmp_path):
+    agent().save(tmp_path / "model")
+    for make in (lambda: agent(device=device), lambda: WPT.load(tmp_path / "model", device=device)):
+        with pytest.raises(ValueError, match=rf"device='{device}' does not work here .*'auto'"):
+            make()
+    model = WPT.load(tmp_path / "model", device="auto")
+    assert model.device.type == "cpu" and model.predict(noise())[0].shape == (4,)

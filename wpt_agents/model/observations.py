@@ -1,0 +1,128 @@
+"""Observations as the networks take them: images of (n, 64, 64, 3) uint8, and nothing else."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from wpt_agents.data.images import resized
+from wpt_agents.data.trajectory import IMAGE_SIZE
+
+Observation = np.ndarray | Mapping[str, np.ndarray]
+CHANNELS = {1: "grayscale", 3: "colour", 4: "RGBA"}
+
+
+def channel_axis(shape: tuple[int, ...]) -> int | None:
+    """The axis of an image that holds its 1, 3 or 4 channels: 2, 0, or None if it is no image.
+
+    :param shape: of one image; colour is looked for before grayscale and RGBA
+    """
+    if len(shape) != 3:
+        return None
+    axes = [axis for channels in ((3,), (1, 4)) for axis in (2, 0) if shape[axis] in channels]
+    return axes[0] if axes else None
+
+
+def image_keys(shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> list[str]:
+    """The entries of a dictionary that are images: those in colour, or else the others.
+
+    :param shapes: for each entry the shape of one observation, and its dtype
+    """
+    channels = {}
+    for key, (shape, dtype) in shapes.items():
+        axis = channel_axis(shape)
+        if axis is not None and dtype == np.uint8:
+            channels[key] = shape[axis]
+    colour = [key for key, n in channels.items() if n == 3]
+    return colour or list(channels)
+
+
+def to_images(observation: Observation, image_key: str | None = None) -> tuple[np.ndarray, bool]:
+    """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
+
+    Takes (H, W, C) and (C, H, W), one or a batch. A single channel is repeated, a fourth (the
+    transparency) is left out, and other sizes are resized.
+
+    :param image_key: the entry to take from a dictionary; its only image if None
+    :raises ValueError: anything that is no uint8 image
+    """
+    if isinstance(observation, Mapping):
+        observation = observation[_key_of(observation, image_key)]
+    observation = np.asarray(observation)
+    batched = observation.ndim == 4
+    images = observation if batched else observation[None]
+    axis = channel_axis(images.shape[1:])
+    if axis is None or images.dtype != np.uint8:
+        raise ValueError(
+            f"An observation must be an image, (H, W, 3) uint8 or a batch of them, got "
+            f"{observation.shape} {observation.dtype}{_range(observation)}; render the environment "
+            "to pixels"
+        )
+    if axis == 0:
+        images = images.transpose(0, 2, 3, 1)
+    if images.shape[-1] != 3:
+        images = np.repeat(images, 3, -1) if images.shape[-1] == 1 else images[..., :3]
+    if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
+        images = resized(images, IMAGE_SIZE)
+    return np.require(images, requirements=("C", "W")), batched
+
+
+def _key_of(observation: Mapping[str, Any], image_key: str | None) -> str:
+    arrays = {key: np.asarray(value) for key, value in observation.items()}
+    shapes = {key: (x.shape[-3:], x.dtype) for key, x in arrays.items() if x.ndim in (3, 4)}
+    images = image_keys(shapes) if image_key is None else [image_key]
+    if len(images) != 1 or images[0] not in arrays:
+        entries = ", ".join(f"{key!r} {x.shape} {x.dtype}" for key, x in arrays.items())
+        raise ValueError(
+            "An observation must be an image, (H, W, 3) uint8 or a batch of them, got a dictionary "
+            f"of {entries}: pass the image alone"
+        )
+    return images[0]
+
+
+def _range(observation: np.ndarray) -> str:
+    """The range of values, for a message; empty where there is none."""
+    if observation.size == 0 or not np.issubdtype(observation.dtype, np.number):
+        return ""
+    return f" with values from {observation.min():.4g} to {observation.max():.4g}"
+
+
+def check_episode_start(episode_start: Any, n: int) -> np.ndarray:
+    """One bool for each of n environments, False everywhere if there is None.
+
+    :raises ValueError: another number of them
+    """
+    first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
+    if first.shape == () and n == 1:
+        return first[None]
+    if first.shape != (n,):
+        raise ValueError(
+            f"episode_start has the shape {first.shape}, but the observation is of {n} "
+            f"environments: pass {n} bools, or None where no episode begins"
+        )
+    return first
+
+
+def check_state(state: Any, shapes: tuple[tuple[int, ...], ...], n: int) -> None:
+    """Refuses a recurrent state that is not of this model.
+
+    :param shapes: of its arrays, without the axis of the environments
+    :raises ValueError: another kind of state, or one of another number of environments
+    """
+    remedy = "pass the state that this model's own predict returned, or None"
+    if not isinstance(state, tuple | list) or len(state) != len(shapes):
+        what = f"{type(state).__name__} of {len(state)}" if hasattr(state, "__len__") else state
+        raise ValueError(f"The state is a tuple of {len(shapes)} arrays, got {what}: {remedy}")
+    got = [np.shape(part) for part in state]
+    if [shape[1:] for shape in got] != list(shapes):
+        expected = ", ".join(str((n, *shape)) for shape in shapes)
+        raise ValueError(
+            f"The state's arrays have the shapes {', '.join(map(str, got))}, this model's are "
+            f"{expected}: {remedy}"
+        )
+    lengths = {shape[0] for shape in got}
+    if lengths != {n}:
+        raise ValueError(
+            f"The state is of {lengths.pop()} environments, the observation of {n}: pass "
+            "state=None where all episodes begin"
+        )

@@ -1,0 +1,219 @@
+"""What an agent accepts as an environment, made into a VecEnv of Stable-Baselines3."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from importlib import import_module
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecExtractDictObs,
+    VecMonitor,
+)
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
+
+from wpt_agents.model.observations import image_keys
+from wpt_agents.training.gymnasium_vector import GymnasiumVecEnv
+
+# Namespaces of ids, and the package that registers them as soon as it is imported. A name is no
+# import, so that the agent goes on to know no task.
+REGISTERED_BY = {"wpt": "wpt_envs", "gym_pusht": "gym_pusht", "gym_aloha": "gym_aloha"}
+
+ACCEPTED = (
+    "an id, a Gymnasium environment, a function that makes one, a list of these, a "
+    "gymnasium.vector environment or a VecEnv of Stable-Baselines3"
+)
+
+
+def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> VecEnv:
+    """Any environment as a VecEnv whose observations belong to nobody else.
+
+    :param env: an id, a Gymnasium environment, a function that makes one, a list of these, a
+        `gymnasium.vector` environment or a VecEnv
+    :param image_key: the entry to see of Dict observations; their only image if None
+    :param monitor: record each episode's return and length
+    """
+    if isinstance(env, VectorEnv):
+        if isinstance(env.unwrapped, SyncVectorEnv):
+            env.unwrapped.envs = [_owning(each) for each in env.unwrapped.envs]
+        vec_env: VecEnv = GymnasiumVecEnv(env)
+        vec_env = VecMonitor(vec_env) if monitor else vec_env
+    elif isinstance(env, VecEnv):
+        vec_env = env
+        _own_observations(vec_env)
+    else:
+        several = list(env) if isinstance(env, Sequence) and not isinstance(env, str) else [env]
+        vec_env = _side_by_side([_monitored(make(each), monitor) for each in several])
+    if isinstance(vec_env.observation_space, spaces.Dict):
+        key = _image_key(vec_env.observation_space, image_key)
+        vec_env = VecExtractDictObs(vec_env, key) if key is not None else vec_env
+    elif image_key is not None:
+        raise ValueError(
+            f"image_key={image_key!r} chooses from Dict observations, but the environment's are "
+            f"{vec_env.observation_space}: leave image_key out"
+        )
+    return vec_env
+
+
+def make(env: Any) -> gym.Env:
+    """One Gymnasium environment from an id, a spec, a function or a class that makes it, or itself.
+
+    :raises ValueError: anything else, with what to write instead
+    """
+    if isinstance(env, gym.Env):
+        return env
+    if isinstance(env, str):
+        return _make_id(env)
+    if isinstance(env, EnvSpec):
+        return gym.make(env)
+    if hasattr(env, "action_spec") and hasattr(env, "observation_spec"):
+        return _refuse_dm_env(env)
+    if callable(env):
+        return make(env())
+    if any(base.__module__.split(".")[0] == "gym" for base in type(env).__mro__):
+        return _patch_env(env)  # OpenAI Gym, by way of Shimmy
+    raise ValueError(f"This {type(env).__name__} is no environment: give {ACCEPTED}")
+
+
+def _make_id(env_id: str) -> gym.Env:
+    namespace = env_id.split("/")[0] if "/" in env_id and ":" not in env_id else None
+    known = {spec.namespace for spec in gym.registry.values()}
+    if namespace in REGISTERED_BY and namespace not in known:
+        import_module(REGISTERED_BY[namespace])
+    try:
+        made = maybe_make_env(env_id, verbose=0)
+    except gym.error.NamespaceNotFound as error:
+        remedy = f"import the package that registers it, or name it in the id: 'package:{env_id}'"
+        raise gym.error.NamespaceNotFound(f"{error} If so, {remedy}") from error
+    assert isinstance(made, gym.Env), made
+    return made
+
+
+def _refuse_dm_env(env: Any) -> gym.Env:
+    name = type(env).__name__
+    if hasattr(env, "physics"):
+        raise ValueError(
+            f"This {name} is a dm_env. Wrap it by Shimmy (pip install 'shimmy[dm-control]'): "
+            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array'))`"
+        )
+    raise ValueError(
+        f"This {name} is a dm_env. Write a gymnasium.Env around it, as Shimmy does for dm_control, "
+        "whose observations are its images"
+    )
+
+
+def _monitored(env: gym.Env, monitor: bool) -> gym.Env:
+    return _owning(Monitor(env) if monitor and not is_wrapped(env, Monitor) else env)
+
+
+def _side_by_side(envs: list[gym.Env]) -> VecEnv:
+    if not envs:
+        raise ValueError(f"An empty list has no environment: give {ACCEPTED}")
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise ValueError(
+            "The list holds the same environment twice, whose episodes would mix: make one for "
+            "each place, for example by [make_env() for _ in range(4)]"
+        )
+    for place, env in enumerate(envs):
+        for name in ("observation_space", "action_space"):
+            first, other = getattr(envs[0], name), getattr(env, name)
+            if first != other:
+                raise ValueError(
+                    f"All environments of a list must have one {name}: number 0 has {first}, "
+                    f"number {place} {other}"
+                )
+    functions: list[Callable[[], gym.Env]] = [lambda env=env: env for env in envs]  # type: ignore
+    return DummyVecEnv(functions)
+
+
+class OwnObservation(gym.ObservationWrapper):
+    """Copies each observation, as some environments draw the next one into the same array."""
+
+    def observation(self, observation: Any) -> Any:
+        """The same values in arrays of their own."""
+        return observation.copy() if isinstance(observation, np.ndarray) else deepcopy(observation)
+
+
+def _owning(env: gym.Env) -> gym.Env:
+    return env if is_wrapped(env, OwnObservation) else OwnObservation(env)
+
+
+def _own_observations(env: VecEnv) -> None:
+    """Makes the environments of a DummyVecEnv copy: it resets before it reports the last image."""
+    inner = _innermost(env)
+    if isinstance(inner, DummyVecEnv):
+        inner.envs = [_owning(each) for each in inner.envs]
+
+
+def _innermost(env: VecEnv | None) -> VecEnv | None:
+    while isinstance(env, VecEnvWrapper):
+        env = env.venv
+    return env
+
+
+def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
+    """The entry to see, None if there is none; warns of what is left out."""
+    boxes = {key: box for key, box in space.spaces.items() if isinstance(box, spaces.Box)}
+    images = image_keys({key: (box.shape, box.dtype) for key, box in boxes.items()})
+    if image_key is not None:
+        if image_key not in space.spaces:
+            names = ", ".join(map(repr, space.spaces))
+            raise ValueError(f"No entry {image_key!r} in the Dict observations. There are: {names}")
+        return image_key
+    if len(images) > 1:
+        names = ", ".join(map(repr, images))
+        raise ValueError(
+            f"The Dict observations hold {len(images)} images, {names}: choose one by "
+            f"image_key={images[0]!r}, or by wpt_envs.pixels(env, image_key={images[0]!r})"
+        )
+    if images:
+        others = ", ".join(repr(key) for key in space.spaces if key != images[0])
+        warnings.warn(
+            f"Of the Dict observations the agent sees {images[0]!r}"
+            + f", not {others}" * bool(others),
+            stacklevel=4,
+        )
+    return images[0] if images else None
+
+
+# ----------------------------------------------------------------------- the end of an episode
+
+
+def last_observation(
+    env: VecEnv | None, infos: Sequence[Mapping[str, Any]], i: int, first: np.ndarray
+) -> np.ndarray:
+    """What environment i showed last, before the VecEnv reset it.
+
+    Stable-Baselines3 names it `terminal_observation`, Gymnasium `final_obs`, before 1.0
+    `final_observation`.
+
+    :param first: what it shows since; a warning is given if that is the same
+    :raises ValueError: it is not there
+    """
+    names = ("terminal_observation", "final_obs", "final_observation")
+    last = next((infos[i][name] for name in names if infos[i].get(name) is not None), None)
+    if last is None:
+        raise ValueError(
+            f"Environment {i} of the {type(env).__name__} ended an episode without its last "
+            "observation: a VecEnv puts it into infos[i]['terminal_observation'] before it resets, "
+            "as DummyVecEnv of Stable-Baselines3 does"
+        )
+    if not isinstance(_innermost(env), DummyVecEnv) and np.array_equal(last, first):
+        warnings.warn(
+            f"Environment {i} showed the same image at the end of an episode and at the start of "
+            "the next. If it draws all images into one array, the last image is lost: let it "
+            "return observation.copy(), as the agent cannot copy in another process",
+            stacklevel=2,
+        )
+    return last

@@ -1,0 +1,212 @@
+"""Refuse an environment that an agent cannot see or act in, with a line of code that mends it."""
+
+import warnings
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from wpt_agents.data.trajectory import IMAGE_SIZE
+from wpt_agents.model.observations import CHANNELS, channel_axis
+
+IMAGE_SHAPE = (IMAGE_SIZE, IMAGE_SIZE, 3)
+HUGE = 1e9  # bounds beyond this are stand-ins for infinity, such as those of float32 or int32
+
+RENDER = (
+    "make it with render_mode='rgb_array' and take its pictures: `env = wpt_envs.pixels(env)`, or "
+    "`env = gymnasium.wrappers.AddRenderObservation(env)`"
+)
+
+
+def check_spaces(env: VecEnv, max_action_dim: int | None = None) -> None:
+    """Refuse an environment that an agent cannot act in; warn where images will be changed.
+
+    :param max_action_dim: the largest number of actions, or None for any
+    """
+    check_observations(env)
+    check_actions(env.action_space, max_action_dim)
+
+
+# ------------------------------------------------------------------------------- observations
+
+
+def check_observations(env: VecEnv) -> None:
+    """Refuse observations that are no images, naming the wrapper or the conversion to blame."""
+    space = env.observation_space
+    if not is_image(space):
+        raise ValueError(
+            "The agent sees images, a Box of (64, 64, 3) uint8, but the environment's observations "
+            f"are {space}: {_culprit(env) or observation_remedy(space)}"
+        )
+    shape: Any = space.shape
+    axis = channel_axis(shape)
+    assert axis is not None, shape
+    if shape[axis] != 3:
+        culprit = _culprit(env, 3)
+        if culprit:
+            raise ValueError(f"The agent sees in colour, but observations are {space}: {culprit}")
+        how = {1: "repeated to three channels", 4: "taken without their transparency"}[shape[axis]]
+        warnings.warn(f"{CHANNELS[shape[axis]]} observations, {shape}, are {how}", stacklevel=4)
+    height, width = (shape[0], shape[1]) if axis == 2 else (shape[1], shape[2])
+    if (height, width) != (IMAGE_SIZE, IMAGE_SIZE):
+        warnings.warn(f"Observations of {shape} are resized to {IMAGE_SHAPE}", stacklevel=4)
+
+
+def is_image(space: spaces.Space, channels: int | None = None) -> bool:
+    """Whether a space is of uint8 images, of this number of channels if there is one."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return False
+    axis = channel_axis(space.shape)
+    return axis is not None and channels in (None, space.shape[axis])
+
+
+def _layers(env: VecEnv) -> Iterator[Any]:
+    """The environment and what it wraps, from the outside to the inside, as far as it is here."""
+    layer: Any = env
+    while True:
+        yield layer
+        if isinstance(layer, VecEnvWrapper):
+            layer = layer.venv
+        elif isinstance(layer, gym.Wrapper):
+            layer = layer.env
+        elif getattr(layer, "envs", None):
+            layer = layer.envs[0]
+        else:
+            return
+
+
+def _culprit(env: VecEnv, channels: int | None = None) -> str | None:
+    """The wrapper that turns images into something else, and the advice to leave it out."""
+    layers = list(_layers(env))
+    for outer, inner in pairwise(layers):
+        if is_image(inner.observation_space, channels) and outer.observation_space != (
+            inner.observation_space
+        ):
+            name = type(outer).__name__
+            inside = f"underneath it are {inner.observation_space}"
+            if name == "VecNormalize":
+                return f"VecNormalize makes floats of images; give it norm_obs=False: {inside}"
+            if channels == 3:
+                return f"{name} takes the colour away; leave it out: {inside}"
+            if "Stack" in name:
+                inside += ". No stack of frames is needed, as the agent has a memory"
+            return f"{name} makes this of the images; leave it out: {inside}"
+    return None
+
+
+def observation_remedy(space: spaces.Space) -> str:
+    """What turns observations of this space into images, to the letter."""
+    if isinstance(space, spaces.Dict):
+        keys = ", ".join(map(repr, space.spaces))
+        return f"no entry of {keys} is a uint8 image; {RENDER}"
+    if not isinstance(space, spaces.Box) or space.dtype is None:
+        return f"they are no array; {RENDER}"
+    if is_image(spaces.Box(0, 255, space.shape, np.uint8)):
+        return _pixel_values(space)
+    shape = space.shape
+    if len(shape) == 4 and channel_axis(shape[1:]) is not None and space.dtype == np.uint8:
+        return "they are stacks of images; take the newest: " + _observe(
+            "images", "images[-1]", shape[1:]
+        )
+    if len(shape) == 3 and space.dtype == np.uint8 and shape[2] % 3 == 0:
+        return "they are images stacked by their channels; take the newest: " + _observe(
+            "images", "images[..., -3:]", (*shape[:2], 3)
+        )
+    if len(shape) == 3 and space.dtype == np.uint8 and shape[0] % 3 == 0:
+        return "they are images stacked by their channels; take the newest: " + _observe(
+            "images", "images[-3:]", (3, *shape[1:])
+        )
+    if len(shape) == 2 and space.dtype == np.uint8 and min(shape) > 1:
+        return "they are grayscale images without an axis for the channel; add one: " + _observe(
+            "image", "image[..., None]", (*shape, 1)
+        )
+    return f"they are no images; {RENDER}"
+
+
+def _pixel_values(space: spaces.Box) -> str:
+    """How values of this dtype and these bounds become bytes."""
+    low, high = float(space.low.min()), float(space.high.max())
+    if (low, high) == (0, 255):
+        formula, what = "image.round().astype('uint8')", f"bytes stored as {space.dtype}"
+    elif np.isfinite([low, high]).all() and high > low:
+        shifted = "image" if low == 0 else f"(image - {low:g})"
+        formula = f"({255 / (high - low):g} * {shifted}).round().clip(0, 255).astype('uint8')"
+        what = f"{space.dtype} images in [{low:g}, {high:g}]"
+    else:
+        formula = "(255 * image).round().clip(0, 255).astype('uint8')"
+        what = f"{space.dtype} images without bounds; if their values are in [0, 1]"
+    return f"they are {what}; convert them: " + _observe("image", formula, space.shape)
+
+
+def _observe(name: str, formula: str, shape: tuple[int, ...]) -> str:
+    return (
+        f"`env = gymnasium.wrappers.TransformObservation(env, lambda {name}: {formula}, "
+        f"gymnasium.spaces.Box(0, 255, {shape}, 'uint8'))` around each single environment"
+    )
+
+
+# ------------------------------------------------------------------------------------ actions
+
+
+def check_actions(space: spaces.Space, max_action_dim: int | None) -> None:
+    """Refuse actions that are no flat Box with finite bounds, or that are too many."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(
+            f"The agent acts in a one-dimensional Box, the environment takes {space}: "
+            f"{action_remedy(space)}"
+        )
+    bounds = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
+    if not (bounds < HUGE).all():
+        raise ValueError(
+            f"The action space must have finite bounds, it is {space}: say how far the actions "
+            f"reach, for example from -1 to 1, by {_act('action', space.shape[0])}. "
+            "gymnasium's ClipAction also hides the bounds; leave it out, as the agent keeps to them"
+        )
+    if max_action_dim is not None and space.shape[0] > max_action_dim:
+        raise ValueError(
+            f"The environment has {space.shape[0]} actions, the model was made for at most "
+            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
+        )
+
+
+def action_remedy(space: spaces.Space) -> str:
+    """What turns actions of this space into a flat Box, to the letter."""
+    if isinstance(space, spaces.Box):
+        formula = f"action.reshape({space.shape})"
+        bounds = "gymnasium.spaces.Box(env.action_space.low.ravel(), env.action_space.high.ravel()"
+        return f"flatten it by {_act(formula, box=f'{bounds}, dtype={space.dtype.name!r})')}"
+    if isinstance(space, spaces.Discrete):
+        start = f" + {space.start}" if space.start else ""
+        choice = _act(f"int(action.argmax()){start}", int(space.n))
+        return f"wrap it so that the largest of {space.n} numbers decides, by {choice}"
+    if isinstance(space, spaces.MultiBinary) and len(space.shape) == 1:
+        bits = _act("(action > 0).astype('int8')", space.shape[0])
+        return f"wrap it so that positive numbers switch on, by {bits}"
+    if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:
+        tops = f"numpy.array({(space.nvec - 1).tolist()})"
+        formula = f"((action + 1) / 2 * {tops}).round().astype('int64')"
+        if space.start.any():
+            formula += f" + numpy.array({space.start.tolist()})"
+        return f"wrap it so that each number is rounded, by {_act(formula, space.shape[0])}"
+    parts = spaces.flatten_space(space) if space.is_np_flattenable else None
+    members = _members(space)
+    if isinstance(parts, spaces.Box) and all(isinstance(each, spaces.Box) for each in members):
+        formula = "gymnasium.spaces.unflatten(space, action)"
+        box = "gymnasium.spaces.flatten_space(env.action_space)"
+        return f"flatten it by {_act(formula, box=box, more=', space=env.action_space')}"
+    return "wrap it with gymnasium.wrappers.TransformAction so that it takes a one-dimensional Box"
+
+
+def _members(space: spaces.Space) -> list[spaces.Space]:
+    if isinstance(space, spaces.Dict):
+        return list(space.spaces.values())
+    return list(space.spaces) if isinstance(space, spaces.Tuple) else []
+
+
+def _act(formula: str, width: int = 0, box: str = "", more: str = "") -> str:
+    box = box or f"gymnasium.spaces.Box(-1.0, 1.0, ({width},))"
+    return f"`env = gymnasium.wrappers.TransformAction(env, lambda action{more}: {formula}, {box})`"

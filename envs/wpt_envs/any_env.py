@@ -1,11 +1,17 @@
 """The same observation, repeat and padding around any Gymnasium environment that renders."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
+from wpt_envs.pictures import PictureReader, shrink
+from wpt_envs.simulation import find_simulation, model_and_data, usual_camera
 from wpt_envs.wrappers import dress
+
+if TYPE_CHECKING:
+    from wpt_envs.rendering import Camera, View
 
 
 def pixels(
@@ -15,20 +21,30 @@ def pixels(
     action_repeat: int = 1,
     pad_action_to: int | None = None,
     rendering: str | None = None,
-    camera: str | int | dict[str, Any] = -1,
+    camera: "Camera | None" = None,
+    image_key: str | None = None,
     state_in_info: bool = False,
     render_size: int | None = None,
 ) -> gym.Env:
-    """`env` seen through its own `render()`, or drawn by this package's renderer.
+    """Show `env` by its own `render()`, by an entry of its observations, or by our renderer.
 
-    :param rendering: `exact`, `near` or `fast` draws a MuJoCo environment, one with `model`
-        and `data`, several times quicker; `None` shrinks what `env.render()` answers
-    :param camera: the camera to draw from; only together with `rendering`
+    :param env: any Gymnasium environment
+    :param image_size: side of the observed image, to which pictures are shrunk
+    :param action_repeat: steps of `env` in one step, their rewards summed
+    :param pad_action_to: width to which actions are padded
+    :param rendering: `exact`, `near` or `fast` draws a MuJoCo environment several times quicker
+        than its own `render()` does
+    :param camera: name, number or attributes of the camera to draw from, only together with
+        `rendering`; the environment's own if None
+    :param image_key: the entry of Dict observations that is the picture, in place of `render()`
+    :param state_in_info: put the observation of `env` into `info["state"]`
+    :param render_size: side of what `render()` returns; the last observation if None
+    :raises ValueError: an environment that cannot be shown in this way
 
     >>> env = wpt_envs.pixels(gym.make("Ant-v5", render_mode="rgb_array"))
     """
     return dress(
-        _LookRendered(env) if rendering is None else _LookDrawn(env, rendering, camera),
+        _looked_at(env, rendering, camera, image_key),
         image_size=image_size,
         action_repeat=action_repeat,
         pad_action_to=pad_action_to,
@@ -37,8 +53,20 @@ def pixels(
     )
 
 
+def _looked_at(
+    env: gym.Env, rendering: str | None, camera: "Camera | None", image_key: str | None
+) -> gym.Env:
+    if rendering is None and camera is not None:
+        raise ValueError(f"camera={camera!r} needs our renderer: add rendering='near', for example")
+    if image_key is not None:
+        if rendering is not None:
+            raise ValueError("image_key and rendering are two ways to see: give one of them")
+        return _LookObserved(env, image_key)
+    return _LookRendered(env) if rendering is None else _LookDrawn(env, rendering, camera)
+
+
 class _LookRendered(gym.Wrapper):
-    """Looks by `env.render()`, shrunk by averaging over areas."""
+    """Looks by `env.render()`."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -46,44 +74,89 @@ class _LookRendered(gym.Wrapper):
             raise ValueError(
                 f"{env} has render_mode={env.render_mode!r}; make it with render_mode='rgb_array'"
             )
+        self._reader = PictureReader(f"render() of {env}", "make it with render_mode='rgb_array'")
 
     def look(self, size: int) -> np.ndarray:
         """The picture now: (size, size, 3) uint8."""
-        image = np.asarray(self.env.render(), np.float32)
-        rows, columns = _areas(image.shape[0], size), _areas(image.shape[1], size)
-        image = np.einsum("ih,hwc,jw->ijc", rows, image, columns, optimize=True)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return shrink(self._reader.read(self.env.render()), size)
+
+
+class _LookObserved(gym.Wrapper):
+    """Looks at one entry of the Dict observations."""
+
+    def __init__(self, env: gym.Env, image_key: str) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Dict):
+            raise ValueError(
+                f"image_key={image_key!r} chooses from Dict observations, but those of {env} are "
+                f"{space}: leave image_key out"
+            )
+        if image_key not in space.spaces:
+            names = ", ".join(map(repr, space.spaces))
+            raise ValueError(
+                f"No entry {image_key!r} in the observations of {env}. There are: {names}"
+            )
+        self._key, self._seen = image_key, np.zeros((1, 1, 3), np.uint8)
+        source = f"The observation {image_key!r} of {env}"
+        self._reader = PictureReader(source, "choose another image_key")
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode and keep its first picture."""
+        observation, info = self.env.reset(**kwargs)
+        self._seen = self._reader.read(observation[self._key])
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and keep the picture after it."""
+        observation, *outcome = self.env.step(action)
+        self._seen = self._reader.read(observation[self._key])
+        return observation, *outcome
+
+    def look(self, size: int) -> np.ndarray:
+        """The picture now: (size, size, 3) uint8."""
+        return shrink(self._seen, size)
 
 
 class _LookDrawn(gym.Wrapper):
     """Looks through a camera of this package's renderer."""
 
-    def __init__(
-        self, env: gym.Env, rendering: str, camera: str | int | dict[str, Any] = -1
-    ) -> None:
+    def __init__(self, env: gym.Env, rendering: str, camera: "Camera | None" = None) -> None:
         super().__init__(env)
-        inner = env.unwrapped
-        if not hasattr(inner, "model") or not hasattr(inner, "data"):
-            raise ValueError(f"{env} is no MuJoCo environment; give rendering=None")
+        self._simulation = find_simulation(env.unwrapped)
+        if self._simulation is None:
+            raise ValueError(
+                f"rendering={rendering!r} draws MuJoCo simulations, and none was found in {env}: "
+                "leave rendering out, which takes the picture that its render() returns"
+            )
+        self._rendering, self._camera = rendering, camera
+        self._view: View | None = None
+        self._model: Any = None
+        self._open()  # complains now of an unknown rendering or camera
+        self._model = None  # the usual camera looks at the middle of the first picture
+
+    def _open(self) -> "View":
+        """The view of the simulation, a new one where the environment has made a new model."""
         from wpt_envs.rendering import View  # brings MuJoCo, which a CartPole does not need
 
-        self._view = View(inner.model, inner.data, rendering, camera)
+        found = model_and_data(self._simulation)
+        assert found is not None, self._simulation
+        model, data = found
+        if self._view is None or model is not self._model:
+            if self._view is not None:
+                self._view.close()
+            camera = self._camera
+            if camera is None:
+                camera = usual_camera(self.env.unwrapped, model, data)
+            self._view, self._model = View(model, data, self._rendering, camera), model
+        return self._view
 
     def look(self, size: int) -> np.ndarray:
         """The picture now: (size, size, 3) uint8."""
-        return self._view.look(size)
+        return self._open().look(size)
 
     def close(self) -> None:
-        """Frees the GL contexts, then closes the environment."""
-        self._view.close()
+        """Free the GL contexts, then close the environment."""
+        if self._view is not None:
+            self._view.close()
         super().close()
-
-
-def _areas(pixels_in: int, pixels_out: int) -> np.ndarray:
-    """(pixels_out, pixels_in): the share of each pixel in each of the new ones."""
-    edges_in = np.linspace(0, 1, pixels_in + 1)
-    edges = np.linspace(0, 1, pixels_out + 1)
-    overlap = np.minimum(edges[1:, None], edges_in[1:]) - np.maximum(
-        edges[:-1, None], edges_in[:-1]
-    )
-    return (np.clip(overlap, 0, None) * pixels_out).astype(np.float32)

@@ -1,41 +1,152 @@
 """Chooses how to draw without a display, before mujoco or dm_control is imported.
 
-On Linux with `MUJOCO_GL` unset MuJoCo asks for a window and, without a display, aborts the
-process. So importing this package sets it to `egl`, and the first task or renderer to `osmesa`
-if EGL does not work and OSMesa is there.
+On Linux with `MUJOCO_GL` unset MuJoCo asks for a window and, without a display, aborts the process.
+Importing this package therefore sets it to `egl`, and the first task or renderer changes that to
+`osmesa` if EGL does not work and OSMesa is there. What the user has set is kept where it works, and
+refused in one sentence where it does not.
 """
 
 import ctypes
+import difflib
+import importlib
 import os
 import sys
+import warnings
 
 _INSTALL = (
     "Drawing off screen needs EGL or OSMesa. If neither works, install one: "
     "`apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri` or `apt-get install libosmesa6`."
 )
+_ANY = ("", "on", "enable", "enabled", "true", "1")  # values of MUJOCO_GL that leave the choice
+_NONE = ("off", "disable", "disabled", "false", "0")  # and those that forbid to draw
+_WINDOW = ("glfw", "glx")
+_OFF_SCREEN = ("egl", "osmesa")
+_EGL_VARIABLES = ("__EGL_VENDOR_LIBRARY_FILENAMES", "__EGL_VENDOR_LIBRARY_DIRS", "EGL_PLATFORM")
 _PLATFORM_DEVICE = 0x313F  # EGL_PLATFORM_DEVICE_EXT
 _preferred_here = False
 
 
-def _egl_works() -> bool:
-    """Whether some EGL device opens; asked of the library itself, which cannot abort."""
+def prefer_egl() -> None:
+    """Set `MUJOCO_GL` where the user left the choice, and mend harmless spellings of it."""
+    global _preferred_here
+    # Mesa's software rasteriser reads this when dm_control or MuJoCo first open it. At 64 x 64
+    # its threads cost more than they bring, and a forked process would wait for them for ever.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    if sys.platform != "linux":
+        return
+    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if asked in _ANY:
+        wants_osmesa = _pyopengl_platform() == "osmesa" and _osmesa_works()
+        asked, _preferred_here = "osmesa" if wants_osmesa else "egl", not wants_osmesa
+    os.environ["MUJOCO_GL"] = asked
+    if not os.environ.get("MUJOCO_EGL_DEVICE_ID", "any").strip():
+        del os.environ["MUJOCO_EGL_DEVICE_ID"]  # MuJoCo cannot read an empty one
+    _agree_with_pyopengl()
+    if "dm_control._render" in sys.modules:
+        _correct_dm_control()
+
+
+def choose() -> None:
+    """Try out what `MUJOCO_GL` asks for; what `prefer_egl` set gives way to OSMesa if need be.
+
+    :raises RuntimeError: a value that does not work here, with the value that would
+    """
+    global _preferred_here
+    asked = os.environ.get("MUJOCO_GL", "")
+    if sys.platform != "linux" or asked == "":
+        return
+    _check_name(asked)
+    if asked == "egl":
+        _check_device()
+    works = {"egl": _egl_works, "osmesa": _osmesa_works}.get(asked, _window_works)
+    if works():
+        return
+    if asked in _WINDOW:
+        raise RuntimeError(
+            f"MUJOCO_GL={asked} draws in a window, but there is no display that works: unset "
+            "MUJOCO_GL, or set MUJOCO_GL=egl"
+        )
+    if not _preferred_here:
+        raise RuntimeError(
+            f"MUJOCO_GL={asked} does not work here; unset it. {_INSTALL}{_suspects()}"
+        )
+    if not _osmesa_works():
+        raise RuntimeError(_INSTALL + _suspects())
+    os.environ["MUJOCO_GL"], _preferred_here = "osmesa", False
+    _agree_with_pyopengl()
+
+
+def _check_name(asked: str) -> None:
+    if asked in _NONE:
+        raise RuntimeError(
+            f"MUJOCO_GL={asked} forbids to draw, and pictures are drawn here: unset MUJOCO_GL, or "
+            "set MUJOCO_GL=egl"
+        )
+    valid = (*_OFF_SCREEN, *_WINDOW)
+    if asked not in valid:
+        near = difflib.get_close_matches(asked, valid, n=1, cutoff=0.5)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise RuntimeError(
+            f"MUJOCO_GL={asked} is not known.{hint} There are: {', '.join(valid)}, or leave it "
+            "unset"
+        )
+
+
+def _check_device() -> None:
+    """Refuse a number of a device that EGL does not have."""
+    asked = os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    if asked is None:
+        return
+    count = len(_egl_devices())
+    if not asked.strip().isdecimal() or not int(asked) < count:
+        there = f"a number from 0 to {count - 1}" if count else "no device at all"
+        raise RuntimeError(
+            f"MUJOCO_EGL_DEVICE_ID={asked} is no device of EGL, which has {there} here: unset it, "
+            "or set a number. EGL counts the GPUs from 0 and knows no names such as cuda:0"
+        )
+
+
+def _suspects() -> str:
+    found = [f"{name}={os.environ[name]}" for name in _EGL_VARIABLES if os.environ.get(name)]
+    return f" What is set may be the cause: {', '.join(found)}." if found else ""
+
+
+# ------------------------------------------------------------------------------- what works
+
+
+def _egl_library() -> ctypes.CDLL | None:
     try:
         egl = ctypes.CDLL("libEGL.so.1")
     except OSError:
-        return False
+        return None
     egl.eglGetProcAddress.restype = ctypes.c_void_p
-    query = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
-    get_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
-    if not query or not get_display:
-        return False
+    return egl
+
+
+def _egl_devices() -> list[int]:
+    """The handles of EGL's devices, asked of the library itself, which cannot abort."""
+    egl = _egl_library()
+    query = egl.eglGetProcAddress(b"eglQueryDevicesEXT") if egl is not None else None
+    if not query:
+        return []
     query_type = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
-    display_type = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
     devices, count = (ctypes.c_void_p * 16)(), ctypes.c_int()
     query_type(query)(16, devices, ctypes.byref(count))
+    return [device or 0 for device in devices[: count.value]]
+
+
+def _egl_works() -> bool:
+    """Whether the device that is asked for opens, or any if none is."""
+    egl, devices = _egl_library(), _egl_devices()
+    get_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT") if egl is not None else None
+    if egl is None or not get_display:
+        return False
+    display_type = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
     egl.eglInitialize.argtypes = [ctypes.c_void_p] * 3
+    asked = os.environ.get("MUJOCO_EGL_DEVICE_ID")
     return any(
         egl.eglInitialize(display_type(get_display)(_PLATFORM_DEVICE, device, None), None, None)
-        for device in devices[: count.value]
+        for device in (devices if asked is None else [devices[int(asked)]])
     )
 
 
@@ -49,25 +160,40 @@ def _osmesa_works() -> bool:
     return False
 
 
-def prefer_egl() -> None:
-    """Sets `MUJOCO_GL` to `egl` where the user left it unset; costs nothing."""
-    global _preferred_here
-    # Mesa's software rasteriser reads this when dm_control or MuJoCo first open it. At 64 x 64
-    # its threads cost more than they bring, and a forked process would wait for them for ever.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    if "MUJOCO_GL" not in os.environ and sys.platform == "linux":
-        os.environ["MUJOCO_GL"], _preferred_here = "egl", True
+def _window_works() -> bool:
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # glfw warns that there is no display
+        return bool(glfw.init())
 
 
-def choose() -> None:
-    """Tries out what is asked for; what `prefer_egl` set gives way to OSMesa if need be."""
-    global _preferred_here
-    asked = os.environ.get("MUJOCO_GL", "")
-    works = {"egl": _egl_works, "osmesa": _osmesa_works}.get(asked)
-    if works is None or works():
+# ------------------------------------------------------------------- what others have chosen
+
+
+def _pyopengl_platform() -> str:
+    return os.environ.get("PYOPENGL_PLATFORM", "").strip().lower()
+
+
+def _agree_with_pyopengl() -> None:
+    """Set `PYOPENGL_PLATFORM`, by which MuJoCo draws, to what `MUJOCO_GL` says."""
+    asked = os.environ["MUJOCO_GL"]
+    if asked in _OFF_SCREEN and _pyopengl_platform() not in ("", asked):
+        os.environ["PYOPENGL_PLATFORM"] = asked
+
+
+def _correct_dm_control() -> None:
+    """Let dm_control choose again if it was imported first and settled on a window system.
+
+    Its own `physics.render` would fail without a display, or abort the process.
+    """
+    render = sys.modules["dm_control._render"]
+    if render.BACKEND in _OFF_SCREEN or _window_works():
         return
-    if not _preferred_here:
-        raise RuntimeError(f"MUJOCO_GL={asked} does not work here; unset it. {_INSTALL}")
-    if not _osmesa_works():
-        raise RuntimeError(_INSTALL)
-    os.environ["MUJOCO_GL"], _preferred_here = "osmesa", False
+    try:
+        choose()
+    except RuntimeError:
+        return  # whoever draws by this package is told
+    importlib.reload(render)

@@ -1,6 +1,5 @@
 """The one renderer: a model's picture at three prices, from a GL context of its own."""
 
-import atexit
 import os
 import weakref
 from collections.abc import Iterator
@@ -8,7 +7,6 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,8 @@ from wpt_envs.meshes import thin_meshes
 
 choose()  # before MuJoCo reads MUJOCO_GL
 import mujoco  # noqa: E402
+
+from wpt_envs.contexts import current, free, new_context  # noqa: E402
 
 _FLAGS = {
     "shadow": mujoco.mjtRndFlag.mjRND_SHADOW,
@@ -104,7 +104,7 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
-        with _current(self._gl):
+        with current(self._gl):
             mujoco.mjr_render(self._viewport, self._scene, self._mjr)
             mujoco.mjr_readPixels(self._pixels, None, self._viewport, self._mjr)
         image = self._pixels if self._flip else self._pixels[::-1]  # GL's first row is the lowest
@@ -113,7 +113,7 @@ class Renderer:
     def upload_terrain(self) -> None:
         """Shows the model's height fields as they are now."""
         if self._gl is not None:
-            with _current(self._gl):
+            with current(self._gl):
                 for field_id in range(self._model.nhfield):
                     mujoco.mjr_uploadHField(self._model, self._mjr, field_id)
 
@@ -131,12 +131,12 @@ class Renderer:
         self._scene = mujoco.MjvScene(self._model, maxgeom=max(1000, 4 * self._model.ngeom))
         for name in self._quality.off:
             self._scene.flags[_FLAGS[name]] = 0
-        self._gl = _new_gl(side)
+        self._gl = new_context(side)
         self._process = os.getpid()
-        with _current(self._gl), _lowered(self._model, self._quality, side):
+        with current(self._gl), _lowered(self._model, self._quality, side):
             self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
-        self._finalizer = weakref.finalize(self, _free, self._gl, self._mjr, self._process)
+        self._finalizer = weakref.finalize(self, free, self._gl, self._mjr, self._process)
 
 
 class View:
@@ -219,54 +219,6 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
     for offset in range(1, factor * factor):
         total += image[offset // factor :: factor, offset % factor :: factor]
     return ((total + factor * factor // 2) // (factor * factor)).astype(np.uint8)
-
-
-# ---------------------------------------------------------------------------- GL contexts
-
-
-def _egl() -> ModuleType | None:
-    if os.environ.get("MUJOCO_GL") != "egl":
-        return None
-    import mujoco.egl
-
-    return mujoco.egl
-
-
-def _new_gl(side: int) -> Any:
-    egl = _egl()
-    if egl is None:
-        from mujoco.gl_context import GLContext
-
-        return GLContext(side, side)
-    context = egl.GLContext(side, side)
-    # MuJoCo and dm_control share one display, and each ends it when Python exits, too early for
-    # the other's contexts; it ends with the process anyway.
-    atexit.unregister(egl.EGL.eglTerminate)
-    return context
-
-
-@contextmanager
-def _current(gl: Any) -> Iterator[None]:
-    """Makes a context current, and afterwards the one which was: others count on theirs."""
-    egl = _egl()
-    if egl is None:
-        gl.make_current()
-        yield
-        return
-    before = egl.EGL.eglGetCurrentContext() or egl.EGL.EGL_NO_CONTEXT
-    gl.make_current()
-    try:
-        yield
-    finally:
-        nothing = egl.EGL.EGL_NO_SURFACE
-        egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, before)
-
-
-def _free(gl: Any, mjr: mujoco.MjrContext, process: int) -> None:
-    if process == os.getpid():
-        with _current(gl):
-            mjr.free()
-        gl.free()
 
 
 # ------------------------------------------------------------------- cheaper uploads

@@ -11,11 +11,10 @@ from gymnasium import spaces
 from wpt_envs import tasks
 from wpt_envs.rendering import Camera, View  # before gymnasium_robotics: it chooses the GL backend
 from wpt_envs.simulated import Achieved, StepResult
+from wpt_envs.simulation import fixed_usual_camera
 from wpt_envs.wrappers import dress
 
 # isort: split
-import mujoco
-
 with redirect_stderr(StringIO()):  # a notice about its versions, of which ours is fixed
     import gymnasium_robotics
 
@@ -108,7 +107,7 @@ class Robotics(Achieved):
         gym.register_envs(gymnasium_robotics)
         self.robot = cast(Any, gym.make(_IDS[task.name], disable_env_checker=True).unwrapped)
         super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)
-        camera = _usual_camera(self.robot) if camera is None else camera
+        camera = fixed_usual_camera(self.robot, self.robot.model) if camera is None else camera
         self.view = View(self.robot.model, self.robot.data, rendering, camera)
         self.action_space = spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
         self._space = self.robot.observation_space
@@ -134,15 +133,3 @@ class Robotics(Achieved):
         if show_goal is not None:
             show_goal()
         return np.asarray(spaces.flatten(self._space, observation), np.float64)
-
-
-def _usual_camera(robot: Any) -> dict[str, Any]:
-    """Gymnasium's: the environment's own placement, looking at the middle of all shapes.
-
-    Gymnasium takes the middle at its first picture, which comes at any time; here it is that
-    of the model's own pose.
-    """
-    data = mujoco.MjData(robot.model)
-    mujoco.mj_forward(robot.model, data)
-    middle = np.median(data.geom_xpos, axis=0)
-    return {"lookat": middle} | robot.mujoco_renderer.default_cam_config

@@ -136,12 +136,6 @@ def test_changing_an_observation_changes_nothing_else():
     assert env.render().max() == 0
 
 
-def test_shrinking_averages_over_areas():
-    env = wpt_envs.pixels(Count(), image_size=1)
-    env.unwrapped.render = lambda: np.repeat([[[0], [30], [60]]], 3, axis=2).astype(np.uint8)
-    assert np.array_equal(env.reset()[0], [[[30, 30, 30]]])
-
-
 def test_discrete_actions_are_seen_and_repeated_but_not_padded():
     env = wpt_envs.pixels(Count(discrete=True), action_repeat=2)
     env.reset()
@@ -155,7 +149,7 @@ def test_an_environment_without_pictures_is_refused_with_the_remedy():
     env.render_mode = None
     with pytest.raises(ValueError, match="render_mode='rgb_array'"):
         wpt_envs.pixels(env)
-    with pytest.raises(ValueError, match="no MuJoCo environment"):
+    with pytest.raises(ValueError, match="none was found in"):
         wpt_envs.pixels(Count(), rendering="near")
 
 

@@ -209,6 +209,7 @@ def test_rendered_pictures_may_be_grayscale_or_transparent():
     for channels in (1, 4):
         env = Seen(lambda i: number.low, number, render=lambda i, c=channels: i[..., [0] * c])
         assert shown(learnt(AddRenderObservation(env))) == CLOCK
+        assert shown(learnt(wpt_envs.pixels(env))) == CLOCK
 
 
 # ------------------------------------------------------------------------------------ actions

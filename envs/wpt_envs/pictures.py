@@ -1,0 +1,98 @@
+"""Pictures as environments return them, checked, made (H, W, 3) uint8 and shrunk to a square."""
+
+from typing import Any
+
+import numpy as np
+
+
+class PictureReader:
+    """Turn what one environment returns as its picture into (H, W, 3) uint8.
+
+    Bytes are taken as they are, other whole numbers if they are in [0, 255]. Floats are in [0, 1]
+    or in [0, 255]: the first picture that is not black decides, and holds for all that follow.
+
+    :param source: what returns the pictures, for messages, such as "render() of <CarRacing>"
+    :param remedy: what to do if there is no picture at all
+    """
+
+    def __init__(self, source: str, remedy: str) -> None:
+        self.source, self.remedy = source, remedy
+        self._scale: float | None = None  # of floats, once it is known
+
+    def read(self, picture: Any) -> np.ndarray:
+        """Check and convert one picture.
+
+        :param picture: (H, W, 3), or with one channel or four, or with the channels first
+        :return: (H, W, 3) uint8, a view where nothing had to be converted
+        :raises ValueError: anything else, by what it is
+        """
+        if picture is None or isinstance(picture, str | bytes | dict):
+            what = "None" if picture is None else f"a {type(picture).__name__}"
+            raise ValueError(f"{self.source} returned {what}, not a picture: {self.remedy}")
+        if isinstance(picture, list | tuple):
+            raise ValueError(
+                f"{self.source} returned a {type(picture).__name__} of {len(picture)}, not one "
+                f"picture as an array: return its last entry, or {self.remedy}"
+            )
+        array = np.asarray(picture)
+        return self._bytes(self._colour(array))
+
+    def _colour(self, array: np.ndarray) -> np.ndarray:
+        """The same picture with three channels, which come last."""
+        if array.ndim == 2:
+            array = array[..., None]
+        if array.ndim == 3 and array.shape[-1] not in (1, 3, 4) and array.shape[0] in (1, 3, 4):
+            array = array.transpose(1, 2, 0)
+        if array.ndim != 3 or array.shape[-1] not in (1, 3, 4) or array.size == 0:
+            raise ValueError(
+                f"{self.source} returned an array of shape {array.shape}: a picture is (H, W, 3), "
+                "in grayscale (H, W) or (H, W, 1), with transparency (H, W, 4)"
+            )
+        return np.repeat(array, 3, -1) if array.shape[-1] == 1 else array[..., :3]
+
+    def _bytes(self, array: np.ndarray) -> np.ndarray:
+        if array.dtype == np.uint8:
+            return array
+        if array.dtype == bool:
+            return array * np.uint8(255)
+        if not np.issubdtype(array.dtype, np.integer) and not np.issubdtype(
+            array.dtype, np.floating
+        ):
+            raise ValueError(f"{self.source} returned an array of {array.dtype}, not of numbers")
+        low, high = float(array.min()), float(array.max())
+        scale = self._scale_of(array.dtype, high)
+        if not (low >= 0 and high * scale <= 255.5):  # NaN fails this, too
+            ends = "[0, 1]" if scale == 255 else "[0, 255]"
+            raise ValueError(
+                f"{self.source} returned {array.dtype} values from {low:.4g} to {high:.4g}, beyond "
+                f"{ends}: return uint8, 0 for black and 255 for white"
+            )
+        return np.rint(array * scale).astype(np.uint8)
+
+    def _scale_of(self, dtype: np.dtype, high: float) -> float:
+        if np.issubdtype(dtype, np.integer):
+            return 1.0
+        if self._scale is None and high > 0:
+            self._scale = 255.0 if high <= 1 else 1.0
+        return self._scale or 1.0
+
+
+def shrink(picture: np.ndarray, size: int) -> np.ndarray:
+    """Average over areas, so that thin lines stay; what is not square is squeezed.
+
+    :param picture: (H, W, 3) uint8
+    :return: (size, size, 3) uint8
+    """
+    rows, columns = _areas(picture.shape[0], size), _areas(picture.shape[1], size)
+    image = np.einsum("ih,hwc,jw->ijc", rows, np.float32(picture), columns, optimize=True)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _areas(pixels_in: int, pixels_out: int) -> np.ndarray:
+    """(pixels_out, pixels_in): the share of each old pixel in each new one."""
+    edges_in = np.linspace(0, 1, pixels_in + 1)
+    edges = np.linspace(0, 1, pixels_out + 1)
+    overlap = np.minimum(edges[1:, None], edges_in[1:]) - np.maximum(
+        edges[:-1, None], edges_in[:-1]
+    )
+    return (np.clip(overlap, 0, None) * pixels_out).astype(np.float32)

@@ -98,7 +98,15 @@ def test_the_reader_of_imports_sees_lazy_and_relative_ones(tmp_path):
 def test_every_third_party_import_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     declared = {re.split("[<>=]", d)[0].replace("-", "_") for d in project["dependencies"]}
-    declared |= {"faiss", "yaml", "PIL", "mujoco", "lxml", "dm_env"}  # other names; simulators'
+    declared |= {
+        "faiss",
+        "yaml",
+        "PIL",
+        "mujoco",
+        "lxml",
+        "dm_env",
+        "glfw",
+    }  # other names; simulators'
     inside = {"wpt_agents", "wpt_envs", ""} | set(sys.stdlib_module_names)
     every = [i for p in ("wpt_agents", "wpt_envs") for m in modules(p) for i in imports(*m)]
     assert {i.split(".")[0] for i in every} - inside <= declared

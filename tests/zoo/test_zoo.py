@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import toy_env
 import yaml
+from debug_agent import recorded
 from rich.console import Console
 from run_folders import make_run
 from scipy import stats
@@ -42,6 +43,15 @@ from wpt_agents.zoo.terminal import console
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
 DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
+MODEL_FREE = {
+    "channels": 2,
+    "feature_dim": 8,
+    "hidden_dim": 16,
+    "batch_size": 4,
+    "update_every": 5,
+    "learning_starts": 25,
+    "warmup_steps": 25,
+}
 SECTIONS = {
     "env": {"action_repeat": 1, "rendering": "fast"},
     "collect": {"tasks": ["dot"], "episodes": 4},
@@ -60,6 +70,10 @@ SECTIONS = {
         "bc_steps": 2,
         "bc_batch_size": 4,
     },
+    "drqv2": MODEL_FREE | {"std": "linear(1,0.1,50)"},
+    "r3m": {"clips": 4},
+    "rlpd": MODEL_FREE | {"critics": 2, "reward_members": 2, "num_retrieve": 3},
+    "sac": {"buffer_size": 100, "learning_starts": 25, "batch_size": 4, "train_freq": 10},
 }
 
 
@@ -104,10 +118,23 @@ def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):
     assert WPT.load(one.folder / "model.zip").num_timesteps == 75
 
 
-@pytest.mark.parametrize("method", METHODS)
+def test_true_rewards_are_asked_of_data_that_hold_them(tmp_path):
+    with pytest.raises(ValueError, match=r"without rewards.*label='zero'"):
+        run(job(tmp_path, "rlpd"))
+    with TrajectoryDataset.create(tmp_path / "own") as data:
+        for seed in range(3):
+            one = recorded(seed=seed, embodiment=DOT.embodiment)
+            data.append(replace(one, reward=np.ones(len(one))))
+    assert run(job(tmp_path / "runs", "rlpd", data=tmp_path / "own")).updates == 10
+
+
+@pytest.mark.parametrize("method", sorted(METHODS.keys() - {"rlpd"}))
 def test_every_method_runs(tmp_path, method):
     result = run(job(tmp_path, method))
-    assert np.isfinite(result.final.mean)
+    assert np.isfinite(result.final.mean) and result.updates > 0
+    if METHODS[method].agent is not WPT:
+        assert ("pretrain" in result.seconds) == (method == "r3m")
+        return
     guided = method not in ("scratch", "pretrain-only", "no-guidance")
     assert ("prior actor" in result.scores) == guided
     assert ("pretrain" in result.seconds) == (method not in ("scratch", "no-pretrain"))

@@ -202,6 +202,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         seed: int | None = None,
         progress_bar: bool = False,
         callback: Callable[[int, dict[str, float]], Any] | None = None,
+        accumulate: int = 1,
         **kwargs: Any,
     ) -> Self:
         """Train the encoder on reward-free trajectories of any robots.
@@ -212,8 +213,11 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         :param run_dir: folder of `model.zip`, which is written every 1,000 updates and at the end;
             if it is there already, training continues from it
         :param callback: called after every update with (step, metrics)
+        :param accumulate: must be 1; `WPT.pretrain` has it, too
         :param kwargs: keywords of `R3M`
         """
+        if accumulate != 1:
+            raise ValueError(f"R3M makes each update in one pass, got accumulate={accumulate}")
         cls.check_keywords(kwargs)
         model = cls(seed=seed, **kwargs)
         model.set_dataset(dataset)

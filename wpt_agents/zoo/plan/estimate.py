@@ -13,7 +13,8 @@ from wpt_agents.zoo.result import read_result
 STORED_STEP = 2_500  # bytes of an image in the dataset, which compresses without loss
 RAW_STEP = 12_288  # bytes of an image in the replay
 PARAMETERS = {"debug": 0.2e6, "tiny": 0.8e6, "small": 3e6, "mid": 6e6, "medium": 18e6}
-LARGEST = 300e6  # parameters of the size "paper", assumed of agents without sizes, too
+PARAMETERS |= {"none": 6e6}  # of agents without sizes: DrQ-v2 as it was published
+LARGEST = 300e6  # parameters of the size "paper"
 WEIGHT = 12  # bytes per parameter in a model file: its value and the optimiser's two averages
 
 
@@ -34,7 +35,7 @@ def disk_needed(jobs: Sequence[Run]) -> int:
 
 def model_bytes(job: Run) -> int:
     """Return the approximate size of a run's model file."""
-    size = job.full_keywords.get("size", "paper")
+    size = job.full_keywords.get("size", "none")
     known = PARAMETERS.get(size, LARGEST) if isinstance(size, str) else LARGEST
     return int(known * WEIGHT)
 

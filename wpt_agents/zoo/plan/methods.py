@@ -3,7 +3,10 @@
 To add a method of WPT, add one entry to `METHODS` with the keywords that differ from the preset.
 To add another agent, write it as a file of `wpt_agents/agents/` and name its class here::
 
-    "drq-v2": Method(DrQv2, shared=("size", "learning_starts"), pretrained=False, needs_data=False),
+    "drq-v2": Method(DrQv2, shared=(), policy="CnnPolicy", pretrained=False, needs_data=False),
+
+With a name in `AGENTS` it has a section in the presets, whose keys are its keywords; a subclass
+also takes the keywords in the section of its base.
 
 The stages (`wpt_agents.zoo.run`) ask of an agent what Stable-Baselines3 asks, so its own algorithms
 run too: `agent(policy, env, seed=, device=, **keywords)`, `learn`, `predict`, `save`, `load`. They
@@ -19,9 +22,13 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
+from wpt_agents.agents.drqv2 import DrQv2
+from wpt_agents.agents.r3m import R3M
+from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 
@@ -30,6 +37,21 @@ RESERVED = {
     *("self", "policy", "env", "dataset", "seed", "device", "verbose", "tensorboard_log"),
     *("embodiment", "episode_length", "policy_kwargs"),
 }
+
+
+# The sections of the presets that hold an agent's keywords, a base before its subclasses.
+AGENTS: dict[str, type[BaseAlgorithm]] = {"drqv2": DrQv2, "r3m": R3M, "rlpd": RLPD, "sac": SAC}
+FRAMES = 3  # images that SB3's agents see at once, as ours do
+
+
+def stacked(venv: VecEnv) -> VecEnv:
+    """Stack the last images of each environment, for agents that see one observation."""
+    return VecFrameStack(venv, FRAMES, channels_order="last")
+
+
+def sections(agent: type[BaseAlgorithm]) -> list[str]:
+    """Return the sections of the presets whose keywords an agent takes."""
+    return [name for name, known in AGENTS.items() if issubclass(agent, known)]
 
 
 @dataclass(frozen=True)
@@ -62,10 +84,14 @@ class Method:
         """The section of `config.yaml` that holds the agent's keywords."""
         return self.agent.__name__.lower()
 
-    def settings(self, preset: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the keywords that the agent is made with, the preset's section `wpt` included."""
-        kept = {k: v for k, v in preset.items() if self.shared is None or k in self.shared}
-        return {**kept, **self.keywords}
+    def settings(self, wpt: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the keywords that the agent is made with.
+
+        :param wpt: the preset's section `wpt`
+        :param own: the keywords of the agent's own sections
+        """
+        kept = {k: v for k, v in wpt.items() if self.shared is None or k in self.shared}
+        return {**kept, **own, **self.keywords}
 
     def takes(self, keyword: str) -> bool:
         """Return whether the agent's constructor has this keyword."""
@@ -83,6 +109,7 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
 
 
 ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
+MODEL_FREE: dict[str, Any] = {"pretrained": False, "shared": (), "policy": "CnnPolicy"}
 METHODS = {
     "wpt": Method(),
     "wpt+": Method(plus=True),
@@ -94,6 +121,14 @@ METHODS = {
     "no-rehearsal": Method(keywords={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
     "random-retrieval": Method(keywords={"retrieval": "random"}),
+    "drq-v2": Method(DrQv2, **MODEL_FREE, needs_data=False),
+    "r3m": Method(R3M, shared=(), policy="CnnPolicy"),
+    "uds": Method(RLPD, {"label": "zero"}, **MODEL_FREE),
+    "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
+    # An upper bound for the two before it: with --data that hold rewards (`collect --rewards`).
+    "rlpd": Method(RLPD, {"label": "true"}, **MODEL_FREE),
+    # As SB3 ships it: what a user has without this library.
+    "sac": Method(SAC, **MODEL_FREE, needs_data=False, wrap=stacked),
 }
 # The methods of the ablation in Fig. 5, by the parts that are on.
 ABLATION = {

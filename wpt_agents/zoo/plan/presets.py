@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, Self, get_type_hints
 
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
-from wpt_agents.zoo.plan.methods import defaults
+from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
 
 EXPLORATION_KEYWORDS = ("steps",)  # of `collect --behaviour explore-state`
 
@@ -103,6 +104,7 @@ class Preset:
 
     :param wpt: keyword arguments of WPT and nothing else
     :param plus: those that the methods `wpt+` and `scratch` use besides: additions to the paper
+    :param agents: the keyword arguments of other agents, by the names of `methods.AGENTS`
     """
 
     env: EnvSettings = EnvSettings()
@@ -112,6 +114,7 @@ class Preset:
     evaluate: EvaluateSettings = EvaluateSettings()
     wpt: dict[str, Any] = field(default_factory=dict)
     plus: dict[str, Any] = field(default_factory=dict)
+    agents: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         counts = {
@@ -132,19 +135,28 @@ class Preset:
         for key in {**self.wpt, **self.plus}:
             if key not in wpt_keywords():
                 raise unknown_name("WPT keyword", key, wpt_keywords())
+        for name, section in self.agents.items():
+            for key in section:
+                if key not in defaults(AGENTS[name]):
+                    raise unknown_name(f"{name} keyword", key, defaults(AGENTS[name]))
+
+    def of_agent(self, agent: type[BaseAlgorithm]) -> dict[str, Any]:
+        """Return the keywords in an agent's sections."""
+        return {k: v for name in sections(agent) for k, v in self.agents.get(name, {}).items()}
 
     @classmethod
     def of(cls, given: Mapping[str, Mapping[str, Any]]) -> Self:
         """Builds a preset from the sections of a YAML file."""
         types = get_type_hints(cls)
         for title, section in given.items():
-            if title not in types:
-                raise unknown_name("section", title, types)
+            if title not in {*types, *AGENTS} - {"agents"}:
+                raise unknown_name("section", title, {*types, *AGENTS} - {"agents"})
             if not isinstance(section, Mapping):
                 raise ValueError(f"Section {title!r} must hold keys and values, got {section!r}.")
         keywords = {t: dict(given.get(t, {})) for t in ("wpt", "plus")}
-        sections = {t: types[t].of(t, s) for t, s in given.items() if t not in keywords}
-        return cls(**sections, wpt=keywords["wpt"], plus=keywords["plus"])
+        agents = {t: dict(s) for t, s in given.items() if t in AGENTS}
+        typed = {t: types[t].of(t, s) for t, s in given.items() if t not in {*keywords, *AGENTS}}
+        return cls(**typed, wpt=keywords["wpt"], plus=keywords["plus"], agents=agents)
 
     @property
     def steps(self) -> int:
@@ -155,6 +167,7 @@ class Preset:
         """Plain dictionaries and lists, as `config.yaml` shows them."""
         given = asdict(self)
         del given["plus"]  # a run's `wpt` holds what of it applies
+        del given["agents"]  # a run's own section holds its agent's keywords
         return given | {"collect": given["collect"] | {"tasks": list(self.collect.tasks)}}
 
 
@@ -249,10 +262,11 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
         raise ValueError(f"--set wants key=value, got {text!r}.")
     title, dot, key = key.strip().rpartition(".")
     if not dot and key not in {*wpt_keywords(), *EXPLORATION_KEYWORDS}:
-        sections = get_type_hints(Preset)
+        types = get_type_hints(Preset)
         dotted = {
-            f"{t}.{k}" for t, s in sections.items() if is_dataclass(s) for k in get_type_hints(s)
+            f"{t}.{k}" for t, s in types.items() if is_dataclass(s) for k in get_type_hints(s)
         }
+        dotted |= {f"{name}.{k}" for name, agent in AGENTS.items() for k in defaults(agent)}
         raise unknown_name("key for --set", key, {*wpt_keywords(), *dotted})
     try:
         return {title or "wpt": {key: read_yaml(value)}}

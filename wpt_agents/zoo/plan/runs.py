@@ -93,7 +93,8 @@ class Run:
     def keywords(self) -> dict[str, Any]:
         """The keywords of the agent, the method's own included."""
         plus = self.preset.plus if self.algorithm.plus else {}
-        return self.algorithm.settings({**self.preset.wpt, **plus})
+        own = self.preset.of_agent(self.algorithm.agent)
+        return self.algorithm.settings({**self.preset.wpt, **plus}, own)
 
     @property
     def full_keywords(self) -> Mapping[str, Any]:
@@ -113,9 +114,11 @@ class Run:
     @property
     def updates(self) -> int | None:
         """The updates that fine-tuning will make, within an episode's worth; None if unknown."""
+        wpt = self.full_keywords
+        if "update_every" in wpt:
+            return max(self.preset.steps - wpt["learning_starts"], 0) // wpt["update_every"]
         if not issubclass(self.algorithm.agent, WPT):
             return None
-        wpt = self.full_keywords
         if self.preset.steps < wpt["learning_starts"]:
             return 0
         earned = self.preset.steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"])

@@ -14,8 +14,10 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.keywords import Stage
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.tasks import find_tasks
 
@@ -98,4 +100,7 @@ class Shared:
     @property
     def pretraining(self) -> Mapping[str, Any]:
         """The preset's keywords of the agent that pre-training looks at."""
+        if self.agent is not WPT and issubclass(self.agent, PixelAgent):
+            looked_at = self.agent.keywords.of_stages(Stage.SIZE, Stage.PRETRAINING)
+            return {k: v for k, v in self.preset.of_agent(self.agent).items() if k in looked_at}
         return {k: v for k, v in self.preset.wpt.items() if k not in FINE_TUNING}

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from wpt_envs.tasks import Task
 
+from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import counted
 from wpt_agents.training.distributed import World
@@ -87,7 +88,8 @@ def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
         finished = world.rank_0s(done.exists())
         state = "reused" if finished else "continued" if model.exists() else "making"
         updates = counted(shared.preset.pretrain.steps, "update")
-        say("pretrain", f"{state} a world model of {updates}  [dim]{folder}")
+        what = "a world model" if shared.agent is WPT else f"the encoder of {shared.agent.__name__}"
+        say("pretrain", f"{state} {what} of {updates}  [dim]{folder}")
         if not finished:
             start = time.perf_counter()
             with log_in(folder) if world.rank == 0 else nullcontext() as callback:

@@ -71,6 +71,7 @@ SECTIONS = {
         "bc_batch_size": 4,
     },
     "drqv2": MODEL_FREE | {"std": "linear(1,0.1,50)"},
+    "jsrl": {"bc_size": "debug", "bc_steps": 2, "bc_batch_size": 4, "warmup_steps": 0},
     "r3m": {"clips": 4},
     "rlpd": MODEL_FREE | {"critics": 2, "reward_members": 2, "num_retrieve": 3},
     "sac": {"buffer_size": 100, "learning_starts": 25, "batch_size": 4, "train_freq": 10},
@@ -134,6 +135,7 @@ def test_every_method_runs(tmp_path, method):
     assert np.isfinite(result.final.mean) and result.updates > 0
     if METHODS[method].agent is not WPT:
         assert ("pretrain" in result.seconds) == (method == "r3m")
+        assert ("prior actor" in result.scores) == (method == "jsrl-bc")
         return
     guided = method not in ("scratch", "pretrain-only", "no-guidance")
     assert ("prior actor" in result.scores) == guided

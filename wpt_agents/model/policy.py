@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import torch
@@ -290,10 +290,24 @@ def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = N
     return Dream(states, action, torch.stack(entropies, 1), share)
 
 
+class HasClone(Protocol):
+    """A policy with a prior actor."""
+
+    prior_actor: PriorActor
+    action_mask: Tensor  # (A,) bool, True at the entries of an action that the robot has
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's actions."""
+
+
 class PriorPolicy:
     """The prior actor with SB3's `predict`; its state is the last three images."""
 
-    def __init__(self, policy: WPTPolicy) -> None:
+    def __init__(self, policy: HasClone) -> None:
         self.policy = policy
 
     def predict(
@@ -329,7 +343,7 @@ def stack_frames(
 
 
 @torch.no_grad()
-def prior_action(policy: WPTPolicy, frames: np.ndarray) -> np.ndarray:
+def prior_action(policy: HasClone, frames: np.ndarray) -> np.ndarray:
     """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
     images = torch.from_numpy(frames).to(policy.device)
     return np.asarray(policy.prior_actor.act(images, policy.action_mask).cpu())

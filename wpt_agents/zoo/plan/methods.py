@@ -27,6 +27,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from wpt_agents.agents.drqv2 import DrQv2
+from wpt_agents.agents.jsrl import JSRL
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
@@ -40,7 +41,13 @@ RESERVED = {
 
 
 # The sections of the presets that hold an agent's keywords, a base before its subclasses.
-AGENTS: dict[str, type[BaseAlgorithm]] = {"drqv2": DrQv2, "r3m": R3M, "rlpd": RLPD, "sac": SAC}
+AGENTS: dict[str, type[BaseAlgorithm]] = {
+    "drqv2": DrQv2,
+    "jsrl": JSRL,
+    "r3m": R3M,
+    "rlpd": RLPD,
+    "sac": SAC,
+}
 FRAMES = 3  # images that SB3's agents see at once, as ours do
 
 
@@ -123,6 +130,7 @@ METHODS = {
     "random-retrieval": Method(keywords={"retrieval": "random"}),
     "drq-v2": Method(DrQv2, **MODEL_FREE, needs_data=False),
     "r3m": Method(R3M, shared=(), policy="CnnPolicy"),
+    "jsrl-bc": Method(JSRL, **MODEL_FREE),
     "uds": Method(RLPD, {"label": "zero"}, **MODEL_FREE),
     "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
     # An upper bound for the two before it: with --data that hold rewards (`collect --rewards`).

@@ -1,0 +1,98 @@
+"""JSRL-BC (Uchendu et al., 2022): DrQ-v2 whose episodes a behaviour clone begins.
+
+Source: https://arxiv.org/abs/2204.02372 with random horizons, as in appendix G of the ICLR 2026
+version of the WPT paper: the clone drives the first h steps of an episode, h in {0, 10, .., 100}.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Policy
+from wpt_agents.model.policy import PriorPolicy, prior_action
+from wpt_agents.model.sizes import SIZES
+from wpt_agents.training.cloning import Cloning, clone
+from wpt_agents.training.keywords import Stage, amount, choice, count
+from wpt_agents.training.rollout import Window
+
+HORIZONS = np.arange(0, 101, 10)  # steps that the clone drives, each equally likely
+
+
+@dataclass(frozen=True, kw_only=True)
+class JSRLKeywords(DrQv2Keywords):
+    """The keywords of `JSRL`."""
+
+    bc_size: str = choice("medium", SIZES, "widths of the clone, a size of WPT", Stage.SIZE)
+    bc_steps: int = count(150_000, "updates of the clone", Stage.CLONING)
+    bc_batch_size: int = count(256, "images and actions in each", Stage.CLONING)
+    bc_learning_rate: float = amount(
+        1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
+    )
+    warmup_steps: int = count(
+        0,
+        "steps at the start that the clone drives alone; DrQ-v2's noise explores instead",
+        Stage.ACTING,
+        least=0,
+    )
+
+
+class JSRL(DrQv2, keywords=JSRLKeywords):
+    """DrQ-v2 with a behaviour clone that drives the first steps of each episode.
+
+    Example::
+
+        model = JSRL("CnnPolicy", "wpt/metaworld-hammer-v0", dataset="data/metaworld")
+        model.learn(75_000)
+
+    The clone learns from trajectories of the task, or else of the robot. It is the prior actor of
+    WPT. The steps that it drives are learned from like any others; offline data are not.
+
+    :param policy: "CnnPolicy"
+    """
+
+    saved_as = "JSRL"
+    hyperparameters: JSRLKeywords
+    shape_keywords = (*DrQv2.shape_keywords, "bc_size")
+
+    def make_policy(self) -> DrQv2Policy:
+        """Make the networks, as wide as the environment's actions."""
+        given = self.hyperparameters
+        widths = given.channels, given.feature_dim, given.hidden_dim
+        size = SIZES[given.bc_size]
+        return DrQv2Policy(self.observation_space, self.action_space, size, *widths)
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether offline data are used: until they are cloned."""
+        return not self.progress.cloned
+
+    def prepare(self, progress_bar: bool) -> None:
+        """Train the clone on the offline data, once for a task."""
+        super().prepare(progress_bar)
+        if self.retrieved is None or self.progress.cloned:
+            return
+        given = self.hyperparameters
+        settings = Cloning(given.bc_steps, given.bc_batch_size, given.bc_learning_rate)
+        trained = clone(
+            self.policy.prior_actor,
+            self.retrieved.trajectories,
+            self.policy.action_mask,
+            settings,
+            self.streams,
+            progress_bar,
+        )
+        self.policy.prior_actor.load_state_dict(trained.state_dict())
+        self.progress.cloned = True
+
+    @property
+    def prior(self) -> PriorPolicy | None:
+        """The clone, with `predict`; None before it is trained."""
+        return PriorPolicy(self.policy) if self.progress.cloned else None
+
+    def guidance_window(self, rng: np.random.Generator) -> Window:
+        """Return the steps of a new episode that the clone drives: 0 .. h - 1."""
+        return (0, int(rng.choice(HORIZONS))) if self.progress.cloned else (0, 0)
+
+    def guide(self, frames: np.ndarray) -> np.ndarray:
+        """Act as the clone, or at random without one: (k, F, 64, 64, 3) -> (k, A)."""
+        return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)

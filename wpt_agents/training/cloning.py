@@ -1,0 +1,62 @@
+"""// Behavior Cloning Policy Training of Algorithm 1: the prior actor imitates trajectories."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
+from dataclasses import dataclass
+
+from torch import Tensor
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import LinearLR
+from tqdm.auto import tqdm
+
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.behavior_cloning import PriorActor, bc_loss, draw_pairs, random_shift
+from wpt_agents.training.descent import descend
+from wpt_agents.training.randomness import Purpose, Streams
+
+
+@dataclass(frozen=True)
+class Cloning:
+    """How a prior actor is trained.
+
+    :param steps: updates
+    :param batch_size: images and actions in an update
+    :param learning_rate: at the first update; it falls linearly to 0
+    :param grad_clip: largest norm of the gradient
+    """
+
+    steps: int
+    batch_size: int
+    learning_rate: float
+    grad_clip: float = 100.0
+
+
+def clone(
+    prior_actor: PriorActor,
+    trajectories: Sequence[Trajectory],
+    action_mask: Tensor,
+    settings: Cloning,
+    streams: Streams,
+    progress_bar: bool = False,
+    autocast: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> PriorActor:
+    """Train a copy of a prior actor, so that an interruption leaves nothing half-learned.
+
+    :param action_mask: (A,) bool, True at the entries of an action that the robot has
+    :param autocast: the context of the forward passes
+    """
+    actor = deepcopy(prior_actor)
+    device = action_mask.device
+    optimizer = AdamW(actor.parameters(), settings.learning_rate, weight_decay=0)
+    falling = LinearLR(optimizer, 1.0, 0.0, settings.steps)  # else the last noisy step is kept
+    for step in tqdm(range(settings.steps), desc="clone", disable=not progress_bar):
+        rng = streams.numpy(Purpose.CLONE, step)
+        pairs = draw_pairs(trajectories, settings.batch_size, len(action_mask), rng)
+        image, action = (tensor.to(device) for tensor in pairs)
+        with autocast():
+            image = random_shift(image, generator=streams.torch(Purpose.CLONE, step, device))
+            loss = bc_loss(actor(image), action, action_mask)
+        descend(optimizer, loss, "bc", settings.grad_clip)
+        falling.step()
+    return actor

@@ -150,7 +150,7 @@ def test_no_gradient_of_the_ensemble_reaches_the_world_model():
         before = weights(model, "world_model.")
         if kind is Plan2Explore:
             model.policy.load_state_dict({**weights(model), **found[0][0]})
-        model._update_world_model(batch, defaultdict(list), generator())
+        model.learner.update_world_model(batch, generator())
         found.append((before, weights(model, "world_model.")))
     assert same(found[0][1], found[1][1])
     assert not same(*found[0])
@@ -162,8 +162,8 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
     dream = model.policy.dream(Latent(*state), 4, generator())
     ensemble = model.policy.curiosity
     ensemble.scale.see(torch.tensor(1.0))
-    model.arrival, model.starts = torch.arange(-1.0, 5.0), torch.arange(1, 6)
-    reward = model._imagined_reward(dream)
+    model.learner.arrival = torch.arange(-1.0, 5.0)
+    reward = model.learner.imagined_reward(dream, torch.arange(1, 6))
     assert reward.shape == (5, 4) and (reward[:, 1:] > 0).all()
     assert reward[:, 0].tolist() == [0, 1, 2, 3, 4]
     step = disagreement(ensemble(dream.states.feat[:, 1], dream.action[:, 1]))
@@ -178,10 +178,9 @@ def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
     model, batch = explorer(Plan2Explore), batch_of(recorded(8), recorded(8, seed=1))
     batch.is_first[0, 4] = True  # an episode's edge
     ensemble = copy.deepcopy(model.policy.curiosity)  # as it is before the update
-    post = model._update_world_model(batch, defaultdict(list), generator())
-    model.starts = torch.arange(18)
+    post, _ = model.learner.update_world_model(batch, generator())
     dream = model.policy.dream(post.flatten_time(), 2, generator())
-    paid = model._imagined_reward(dream)[:, 0].view(2, 9)
+    paid = model.learner.imagined_reward(dream, torch.arange(18))[:, 0].view(2, 9)
     surprise = disagreement(ensemble(post.feat[:, :-1], batch.action[:, 1:]))
     within = ~batch.is_first[:, 1:]
     expected = surprise * within / surprise[within].mean()  # the first mean counts in full
@@ -199,9 +198,8 @@ def test_the_tasks_reward_teaches_nothing(kind):
             reward=torch.full_like(batch.reward, reward),
             reward_known=torch.ones_like(batch.is_first),
         )
-        metrics = defaultdict(list)
-        model._update_world_model(paid, metrics, generator(), learn_reward=True)
-        assert metrics["explore/surprise"][0] > 0
+        _, metrics = model.learner.update_world_model(paid, generator(), learn_reward=True)
+        assert metrics["explore/surprise"] > 0
         found.append(weights(model))
     assert same(*found)
 
@@ -214,7 +212,7 @@ def test_icms_reward_head_learns_the_scaled_surprise_of_each_step():
         surprise = model.policy.curiosity(batch.image, batch.action)[1]
     model.policy.world_model.observe = lambda given, _: seen.append(given) or stop()
     with pytest.raises(StopIteration):
-        model._update_world_model(batch, defaultdict(list), generator(), learn_reward=True)
+        model.learner.update_world_model(batch, generator(), learn_reward=True)
     [given] = seen
     within = ~batch.is_first[:, 1:]
     assert (given.reward_known[:, 1:] == within).all() and not given.reward_known[:, 0].any()

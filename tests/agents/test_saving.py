@@ -56,7 +56,7 @@ def test_a_loaded_model_acts_the_same(learnt, tmp_path):
 def test_a_loaded_model_has_the_same_settings_and_counters(learnt, tmp_path):
     learnt.save(tmp_path / "model.zip")
     loaded = WPT.load(tmp_path / "model.zip", gamma=0.9)
-    assert loaded.hyperparameters == learnt.hyperparameters | {"gamma": 0.9}
+    assert loaded.hyperparameters == learnt.hyperparameters.changed(gamma=0.9)
     assert loaded.gamma == 0.9 and loaded.num_timesteps == 28
     assert loaded.retrieved_ids == learnt.retrieved_ids and loaded.updates == learnt.updates
 
@@ -131,7 +131,7 @@ def test_parameters_can_be_taken_out_and_put_in():
     one, other = agent(ClockEnv()).learn(28), agent(seed=1)
     other.set_parameters(one.get_parameters())
     assert same(weights(one), weights(other))
-    was, now = (m.model_optimizer.state_dict()["state"][0]["exp_avg"] for m in (one, other))
+    was, now = (m.learner.model_optimizer.state_dict()["state"][0]["exp_avg"] for m in (one, other))
     assert torch.equal(was, now)
 
 

@@ -32,6 +32,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from toy_env import LENGTH, DotEnv
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.training.learner import Learner
 from wpt_agents.training.rollout import Rollout
 
 
@@ -118,7 +119,7 @@ def test_a_step_whose_updates_fail_is_not_taken_for_the_next(monkeypatch):
     try:
         model = agent(worker, train_freq="step")
         with monkeypatch.context() as patch, pytest.raises(FloatingPointError):
-            patch.setattr(WPT, "_descend", not_finite)
+            patch.setattr(Learner, "descend", not_finite)
             model.learn(100)
         model.learn(28, reset_num_timesteps=False)
     finally:
@@ -287,9 +288,9 @@ def test_the_prior_actor_remembers_three_images_of_each_episode():
 
 def test_setting_an_environment_forgets_the_open_episode():
     model = agent(clocks(2)).learn(4)
-    assert isinstance(model._rollout, Rollout)
+    assert isinstance(model.rollout, Rollout)
     model.set_env(clocks(4))
-    assert model._rollout is None and model._last_obs is None
+    assert model.rollout is None and model._last_obs is None
 
 
 # --------------------------------------------------------------------------------- evaluation

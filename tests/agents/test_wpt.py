@@ -29,10 +29,10 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.policy import prior_action, stack_frames
-from wpt_agents.training import pretraining
-from wpt_agents.training.guidance import parse_schedule
+from wpt_agents.training import cloning, pretraining
+from wpt_agents.training.learner import Learner
+from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.rollout import Rollout
-from wpt_agents.training.updates import PRETRAIN
 
 
 @pytest.fixture
@@ -99,17 +99,17 @@ def test_pretraining_calls_back_after_every_update_with_finite_metrics(store):
 
 
 def test_pretraining_prepares_batches_ahead_and_draws_them_by_seed_and_step(store, monkeypatch):
-    seen, update = [], WPT._update_world_model
+    seen, update = [], Learner.update_world_model
 
     def watch(self, batch, *rest):
         seen.append(batch)
-        update(self, batch, *rest)
+        return update(self, batch, *rest)
 
-    monkeypatch.setattr(WPT, "_update_world_model", watch)
+    monkeypatch.setattr(Learner, "update_world_model", watch)
     model = pretrained(store, steps=3)
     shape = model.batch_size, model.batch_length, model.max_action_dim
     for step, batch in enumerate(seen):
-        drawn = store.sample(*shape, rng=np.random.default_rng([model.stream_seed, PRETRAIN, step]))
+        drawn = store.sample(*shape, rng=model.streams.numpy(Purpose.PRETRAIN, step))
         assert batch.image.equal(drawn.image) and batch.action.equal(drawn.action)
     assert len(seen) == 3
 
@@ -126,7 +126,7 @@ def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
     # the optimiser's averages too: another step keeps them equal
     batch = store.sample(2, 4, 4, np.random.default_rng(0))
     for model in (parts, whole):
-        model._update_world_model(batch, defaultdict(list), torch.Generator().manual_seed(0))
+        model.learner.update_world_model(batch, torch.Generator().manual_seed(0))
     assert same(weights(parts), weights(whole))
 
 
@@ -465,7 +465,7 @@ def test_an_interrupted_update_costs_none_of_those_that_were_earned(monkeypatch)
 def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch):
     undisturbed = pretrained(store, env=DotEnv(), bc_steps=3).learn(1)
     model = pretrained(store, env=DotEnv(), bc_steps=3)
-    descend, steps = model._descend, []
+    descend, steps = cloning.descend, []
 
     def interrupted(*given):
         steps.append(descend(*given))
@@ -473,7 +473,7 @@ def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch
             monkeypatch.undo()
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(model, "_descend", interrupted)
+    monkeypatch.setattr(cloning, "descend", interrupted)
     with pytest.raises(KeyboardInterrupt):
         model.learn(1)
     assert not model.cloned
@@ -494,7 +494,7 @@ def test_a_learning_rate_of_zero_teaches_nothing(name):
 
 def test_a_given_episode_length_is_kept():
     model = agent(ClockEnv(), episode_length=5).learn(14)
-    assert model.episode_length == model.hyperparameters["episode_length"] == 5
+    assert model.episode_length == model.hyperparameters.episode_length == 5
 
 
 # ------------------------------------------------------------------------------ another task
@@ -604,13 +604,13 @@ def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path)
 def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_path):
     env = Monitor(ClockEnv(length=7))  # no spec: nothing says how long it lasts
     model = pretrained(store, env=env, guidance=1, warmup_steps=0)
-    assert model._episode_length() == 500  # a guess, until an episode has been seen
+    assert model.expected_length() == 500  # a guess, until an episode has been seen
     model.learn(7)
-    assert model._episode_length() == 7
+    assert model.expected_length() == 7
     model.save(tmp_path / "model")
     assert WPT.load(tmp_path / "model", env=ClockEnv(length=7))._episode_length() == 7
     model.reset_task()
-    assert model._episode_length() == 500
+    assert model.expected_length() == 500
 
 
 def test_another_task_starts_from_returns_of_no_known_scale():
@@ -644,11 +644,10 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
             own = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
             error = (own - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
             by_hand += [error.mean().item()] * (t >= 2)
-    metrics = defaultdict(list)
-    loss = model._imitation(post, batch, metrics)
+    loss = model.learner.imitation_loss(post, batch)
     assert model.num_timesteps == 50  # half way from 20 to 0
-    assert loss.item() == pytest.approx(10 * metrics["train/kickstart_loss"][0].item())
-    assert loss.item() == pytest.approx(10 * np.mean(by_hand), rel=1e-4)
+    assert model.hyperparameters.kickstart_at(50) == 10
+    assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-4)
 
 
 def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
@@ -657,14 +656,14 @@ def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
     taught = []
     for weight in (0, 5):
         policy.load_state_dict(before)
-        model._setup_optimizers()
-        model.kickstart_schedule = parse_schedule(weight, np.inf)
+        model.learner = model.make_learner()
+        model.kickstart = weight
         model.updates = 0
         model.update(defaultdict(list))
         taught.append(weights(model))
     moved = {k.split(".")[0] for k in before if (taught[0][k] != taught[1][k]).any()}
     assert moved == {"actor"}
-    assert WPT("WPTPolicy", size="debug").kickstart_schedule(0) == 0
+    assert WPT("WPTPolicy", size="debug").kickstart == 0
 
 
 @pytest.mark.slow
@@ -676,8 +675,7 @@ def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
             **{"env": DotEnv(), "kickstart": kickstart, "guidance": 1, "train_ratio": 8},
             **{"actor_critic_learning_rate": 3e-3, "bc_steps": 30, "return_norm": True},
         ).learn(4 * LENGTH)
-        model.kickstart_schedule = parse_schedule(1)
-        distances.append(model._imitation(*replayed(model), defaultdict(list)).item())
+        distances.append(model.learner.imitation_loss(*replayed(model)).item())
     assert distances[1] < 0.2 * distances[0]
 
 
@@ -690,7 +688,9 @@ def test_kickstarting_alone_has_a_clone_and_wants_windows_of_three_images(store)
 @pytest.mark.filterwarnings("ignore:No dataset")
 def test_kickstarting_without_a_clone_does_not_imitate_an_untrained_one():
     model = agent(DotEnv(), kickstart=1).learn(2 * LENGTH)
-    assert not model.cloned and model._imitation(*replayed(model), defaultdict(list)) == 0
+    metrics = defaultdict(list)
+    model.update(metrics)
+    assert not model.cloned and "train/kickstart_loss" not in metrics
 
 
 def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwarn):

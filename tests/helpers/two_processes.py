@@ -10,6 +10,7 @@ from debug_agent import SETTINGS, weights
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.training import pretraining
+from wpt_agents.training.learner import Learner
 
 
 def train(dataset, **changes):
@@ -48,7 +49,7 @@ def differing(rank, folder):
 
 
 def die_at_the_fifth_update():
-    step, taken = WPT._step, []
+    step, taken = Learner.take_step, []
 
     def dying(self, *args):
         taken.append(0)
@@ -56,4 +57,4 @@ def die_at_the_fifth_update():
             os.kill(os.getpid(), signal.SIGKILL)
         return step(self, *args)
 
-    WPT._step = dying
+    Learner.take_step = dying

@@ -23,6 +23,8 @@ from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import IMAGE_SPACE, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
 from wpt_agents.model.sizes import SIZES
+from wpt_agents.training.model_files import optimizers
+from wpt_agents.training.randomness import Purpose
 
 DEBUG, WIDTH, H = SIZES["debug"], 5, 4
 OWN = torch.tensor([True, True, False, False, False])
@@ -328,7 +330,7 @@ def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
     # to a range of 0, of 3.87: 3.87 * .99 ** 200 = 0.52, which counts as 1
     for width, times, scale in ((3.0, 1, 3.0), (90.0, 1, 3.87), (0.0, 200, 1.0)):
         monkeypatch.setattr(
-            "wpt_agents.training.updates.return_range", lambda _, w=width: torch.tensor(w)
+            "wpt_agents.training.learner.return_range", lambda _, w=width: torch.tensor(w)
         )
         model.policy.return_scale.mul_(0.99 ** (times - 1))
         model.update(metrics)
@@ -374,10 +376,10 @@ def test_the_same_seed_purpose_and_counter_give_the_same_numbers_and_no_other():
     model, twin, other = agent(), agent(), agent(seed=1)
 
     def draw(model, purpose, counter):
-        return model._stream(purpose, counter).integers(2**62)
+        return model.streams.numpy(purpose, counter).integers(2**62)
 
     assert draw(model, 1, 7) == draw(model, 1, 7) == draw(twin, 1, 7)
-    drawn = [draw(model, p, c) for p in range(6) for c in range(50)] + [draw(other, 1, 7)]
+    drawn = [draw(model, p, c) for p in Purpose for c in range(50)] + [draw(other, 1, 7)]
     assert len(set(drawn)) == len(drawn)
 
 

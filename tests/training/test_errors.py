@@ -12,12 +12,12 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents.agents import wpt
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.sizes import SIZES
-from wpt_agents.training import checks, pretraining, updates
+from wpt_agents.training import cloning, learner, pretraining
+from wpt_agents.training.hyperparameters import SIZES_OWN, Hyperparameters
 from wpt_agents.zoo.plan.runs import make_plan
 
 
@@ -127,7 +127,7 @@ def test_a_refused_dataset_leaves_the_run_folder_alone(tmp_path):
         (lambda: agent(precision="fp16"), "No precision 'fp16'.* bf16, fp32"),
         (lambda: agent(guidance="linear(1)"), r"'linear\(start,end,steps\)'"),
         (lambda: agent(free_nats_mode="sum"), "No free_nats_mode 'sum'. .*element, mean"),
-        (lambda: agent(offline_ratio=25), r"offline_ratio is .* \[0, 1\], got 25"),
+        (lambda: agent(offline_ratio=25), r"offline_ratio must be .* \[0, 1\], got 25"),
         (lambda: pretrained([], batchsize=3), "No keyword 'batchsize'. Did you mean 'batch_size'"),
         (lambda: pretrained([], hidden=3), "No keyword 'hidden'. .*There are: .*train_ratio"),
     ],
@@ -197,7 +197,7 @@ def test_observations_that_are_not_bytes_stop_and_nothing_of_them_is_stored():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
 
 
-def poison(monkeypatch, name, after, module=updates):
+def poison(monkeypatch, name, after, module=learner):
     """From call `after` on, the loss of this name is NaN where `module` calls it."""
     function, calls = getattr(module, name), []
 
@@ -232,7 +232,7 @@ def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network
 
 def test_a_clone_whose_loss_is_nan_stops_with_finite_weights(monkeypatch):
     model = pretrained([recorded()], env=DotEnv())
-    poison(monkeypatch, "bc_loss", after=1, module=wpt)
+    poison(monkeypatch, "bc_loss", after=1, module=cloning)
     with pytest.raises(FloatingPointError, match="bc loss is nan"):
         model.learn(LENGTH)
     assert finite(model) and model.prior is None
@@ -246,13 +246,13 @@ def test_pretraining_that_diverges_keeps_its_last_checkpoint(monkeypatch, tmp_pa
             raise_at_next_update()
 
     def raise_at_next_update():
-        loss = updates.world_model_update_loss
+        loss = learner.world_model_update_loss
 
         def spoilt(*args, **kwargs):
             parts, post = loss(*args, **kwargs)
             return parts._replace(total=parts.total * torch.nan), post
 
-        monkeypatch.setattr(updates, "world_model_update_loss", spoilt)
+        monkeypatch.setattr(learner, "world_model_update_loss", spoilt)
 
     with pytest.raises(FloatingPointError, match="world model loss is nan"):
         pretrained([recorded()], steps=6, run_dir=tmp_path, callback=damage)
@@ -273,23 +273,23 @@ def test_damaged_weights_do_not_act():
 
 
 def test_the_debug_settings_are_all_keywords_of_the_constructor():
-    assert set(SETTINGS) <= wpt.KEYWORDS
+    assert set(SETTINGS) <= inspect.signature(WPT).parameters.keys()
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("gamma", 1.5, r"gamma is a share in \[0, 1\], got 1.5"),
-        ("gamma", "high", "gamma is a share"),
-        ("batch_size", 0, "batch_size is a whole number from 1 on, got 0"),
-        ("imagine_horizon", 2.5, "imagine_horizon is a whole number from 2 on"),
-        ("imagine_horizon", 1, "imagine_horizon is a whole number from 2 on, got 1"),
-        ("batch_size", 16.0, "batch_size is a whole number from 1 on, got 16.0"),
-        ("batch_size", float("inf"), "batch_size is a whole number from 1 on, got inf"),
-        ("num_retrieve", True, "num_retrieve is a whole number from 1 on, got True"),
-        ("episode_length", -5, "episode_length is a whole number from 1 on, got -5"),
-        ("train_ratio", None, "train_ratio is a number from 0 on, got None"),
-        ("return_norm", "no", "return_norm is True or False, got 'no'"),
+        ("gamma", 1.5, r"gamma must be a number in \[0, 1\], got 1.5"),
+        ("gamma", "high", "gamma must be a number in"),
+        ("batch_size", 0, "batch_size must be a whole number of at least 1, got 0"),
+        ("imagine_horizon", 2.5, "imagine_horizon must be a whole number of at least 2"),
+        ("imagine_horizon", 1, "imagine_horizon must be a whole number of at least 2, got 1"),
+        ("batch_size", 16.0, "batch_size must be a whole number of at least 1, got 16.0"),
+        ("batch_size", float("inf"), "batch_size must be a whole number of at least 1, got inf"),
+        ("num_retrieve", True, "num_retrieve must be a whole number of at least 1, got True"),
+        ("episode_length", -5, "episode_length must be a whole number of at least 1, got -5"),
+        ("train_ratio", None, "train_ratio must be a number of at least 0, got None"),
+        ("return_norm", "no", "return_norm must be True or False, got 'no'"),
         ("size", 3, "No size 3"),
         ("size", asdict(SIZES["debug"]) | {"gates": "over"}, "No gate layout 'over'"),
         ("size", asdict(SIZES["debug"]) | {"depht": 4}, "No field of Size 'depht'.*depth"),
@@ -297,9 +297,9 @@ def test_the_debug_settings_are_all_keywords_of_the_constructor():
         ("size", asdict(SIZES["debug"]) | {"deter": 60}, "deter=60 cannot be divided into 8"),
         ("size", asdict(SIZES["debug"]) | {"norm_eps": 0}, "norm_eps must be a number above 0"),
         ("size", {"deter": 64}, "lacks hidden, stoch, classes, depth, units"),
-        ("unimix", 0, "unimix=0 allows latents of probability 0"),
-        ("train_ratio", -1, "train_ratio is a number from 0 on, got -1"),
-        ("learning_rate", float("nan"), "learning_rate is a number from 0 on"),
+        ("unimix", 0, "unimix must be a number above 0"),
+        ("train_ratio", -1, "train_ratio must be a number of at least 0, got -1"),
+        ("learning_rate", float("nan"), "learning_rate must be a number of at least 0"),
     ],
 )
 def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
@@ -307,18 +307,20 @@ def test_a_value_that_makes_no_sense_is_refused_by_name(name, value, message):
         agent(**{name: value})
 
 
-def test_every_keyword_that_is_no_schedule_is_checked():
-    lists = checks.COUNTS, checks.SWITCHES, checks.SHARES, checks.AMOUNTS
-    checked = {name for names in [*lists, checks.CHOICES] for name in names}
-    assert wpt.HYPERPARAMETERS - checked == {"guidance", "kickstart", "embodiment", "seed", "size"}
-    keywords = inspect.signature(WPT.__init__).parameters
-    none = {name for name in wpt.HYPERPARAMETERS if keywords[name].default is None}
-    assert none == set(checks.OPTIONAL)
+@pytest.mark.parametrize("name", Hyperparameters.declared())
+def test_every_keyword_is_checked_and_none_is_without_documentation_and_stage(name):
+    with pytest.raises((ValueError, TypeError), match=name.replace("_", ".")):
+        Hyperparameters.of({name: object()})
+    declared = Hyperparameters.declared()[name]
+    assert len(declared.doc) > 5 and not declared.doc.endswith(".")
+    if Hyperparameters().value(name) is not None and name not in SIZES_OWN:
+        with pytest.raises(ValueError, match=name):
+            Hyperparameters.of({name: None})
 
 
 def test_what_open_loop_cannot_show_is_refused_by_name():
     model, seen = agent(), recorded(actions=2)
-    with pytest.raises(ValueError, match=r"context counts .* got 0"):
+    with pytest.raises(ValueError, match=r"context, .* at least 1, got 0"):
         model.open_loop(seen, context=0)
     with pytest.raises(ValueError, match=r"6 actions.*max_action_dim=4"):
         model.open_loop(Trajectory(seen.image, np.zeros((8, 6), np.float32)))
@@ -329,7 +331,7 @@ def test_what_open_loop_cannot_show_is_refused_by_name():
 
 
 def test_a_plan_with_such_a_value_is_refused_before_anything_is_made(tmp_path):
-    with pytest.raises(ValueError, match="gamma is a share"):
+    with pytest.raises(ValueError, match="gamma must be a number in"):
         make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], ["gamma=high"], tmp_path, 1, "cpu")
 
 

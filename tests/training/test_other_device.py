@@ -14,7 +14,7 @@ from wpt_agents import WPT
 from wpt_agents.agents.curious import ICMExplorer, Plan2Explore
 from wpt_agents.model import distributions, policy
 from wpt_agents.model.rssm import filter_sequence
-from wpt_agents.training import randomness, updates
+from wpt_agents.training import randomness
 from wpt_agents.zoo.judge import diagnosis
 
 
@@ -22,7 +22,6 @@ from wpt_agents.zoo.judge import diagnosis
 def other(monkeypatch):
     for module in (
         policy,
-        updates,
         randomness,
         diagnosis,
     ):  # random numbers are the CPU's on both devices

@@ -23,6 +23,7 @@ from wpt_envs.tasks import TASKS, Task
 from zoo_command import call
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.training.learner import Learner
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
@@ -262,7 +263,7 @@ def test_half_a_pretraining_is_continued(tmp_path, monkeypatch):
     run(job(tmp_path))
     shared = job(tmp_path).shared
     (shared.model_path / "done.json").unlink()  # as if killed after the last checkpoint
-    monkeypatch.setattr(WPT, "_update_world_model", lambda *_: pytest.fail("from the start"))
+    monkeypatch.setattr(Learner, "update_world_model", lambda *_: pytest.fail("from the start"))
     pretrain(shared, collect_data(shared))
     assert (shared.model_path / "done.json").exists()
 

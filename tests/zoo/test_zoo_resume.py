@@ -20,6 +20,7 @@ from stable_baselines3.common.logger import configure
 from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.training.learner import Learner
 from wpt_agents.files.model_file import read_model
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
 from wpt_agents.zoo.run import learning, locks, runner
@@ -220,7 +221,7 @@ def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monk
 
 def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monkeypatch):
     monkeypatch.setattr("wpt_agents.training.pretraining.EVERY", 100)
-    shared, update = job(tmp_path, pretrain={"steps": 300}).shared, WPT._update_world_model
+    shared, update = job(tmp_path, pretrain={"steps": 300}).shared, Learner.update_world_model
     dataset, taken = collect_data(shared), []
 
     def dying(*args):
@@ -230,7 +231,7 @@ def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monke
         return update(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(WPT, "_update_world_model", dying)
+        patch.setattr(Learner, "update_world_model", dying)
         with pytest.raises(Killed):
             pretrain(shared, dataset)
     assert (shared.model_path / "progress.csv").read_text().count("\n") == 1 + 3

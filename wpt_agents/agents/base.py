@@ -41,7 +41,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from wpt_agents.agents.attributes import declare
-from wpt_agents.data.convert import Data
+from wpt_agents.data.convert import Data, open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
@@ -66,7 +66,7 @@ class PixelAgent(BaseAlgorithm):
 
     :param policy: the policy's name or class; the first of `policy_aliases` if None
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param dataset: trajectories to learn from: whatever `TrajectoryDataset.of` takes
+    :param dataset: trajectories to learn from: whatever `open_dataset` takes
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 for nothing, 1 for information
     :param device: "auto", "cpu", "cuda", ...
@@ -76,6 +76,7 @@ class PixelAgent(BaseAlgorithm):
     progress_class: ClassVar[type[Progress]] = Progress
     saved_as: ClassVar[str]  # the class that reads the model files; subclasses may share them
     shape_keywords: ClassVar[tuple[str, ...]] = ()  # must be equal where weights are loaded
+    warmup_pays: ClassVar[bool] = False  # whether steps before `learning_starts` pay for updates
 
     policy: Any  # a BasePolicy with the methods of `Acting`
     learner: Any
@@ -187,9 +188,14 @@ class PixelAgent(BaseAlgorithm):
         check_spaces(env)
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use other trajectories from now on: whatever `TrajectoryDataset.of` takes."""
+        """Use other trajectories from now on: whatever `open_dataset` takes."""
         if dataset is not None:
-            self.dataset = TrajectoryDataset.of(dataset)
+            opened = open_dataset(dataset)
+            self.check_data(opened)
+            self.dataset = opened
+
+    def check_data(self, dataset: TrajectoryDataset) -> None:
+        """Refuse a dataset that the agent cannot learn from."""
 
     def prepare(self, progress_bar: bool) -> None:
         """Do what comes before collecting; called by `learn`, when the environment is reset."""
@@ -316,9 +322,7 @@ class PixelAgent(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         ) as callback:
             self.prepare(progress_bar)
-            while self.num_timesteps < self._total_timesteps and self.collect(
-                callback, log_interval
-            ):
+            while self.unfinished and self.collect(callback, log_interval):
                 self.update_models()
         return self
 
@@ -346,6 +350,11 @@ class PixelAgent(BaseAlgorithm):
         finally:
             callback.on_training_end()
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether `learn` has steps left to collect."""
+        return self.num_timesteps < self._total_timesteps
+
     def collect(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Step all environments until an episode ends; return False when a callback says stop."""
         assert self.env is not None
@@ -353,7 +362,7 @@ class PixelAgent(BaseAlgorithm):
         callback.on_rollout_start()
         go_on = True
         ended = False
-        while go_on and not ended and self.num_timesteps < self._total_timesteps:
+        while go_on and not ended and self.unfinished:
             self.before_step()
             image, _ = to_images(self._last_obs)
             action = self.policy.to_env(rollout.act(image))
@@ -361,7 +370,7 @@ class PixelAgent(BaseAlgorithm):
             new_obs, rewards, dones, infos = step_all(self.env, action, meanwhile)
             check_rewards(rewards, self.num_timesteps)
             self.num_timesteps += self.n_envs
-            if self.num_timesteps > self.hyperparameters.learning_starts:
+            if self.warmup_pays or self.num_timesteps > self.hyperparameters.learning_starts:
                 self.credit += self.n_envs
             last = last_images(self.env, infos, dones, new_obs)
             finished = rollout.end_step(rewards, dones, last)
@@ -405,13 +414,19 @@ class PixelAgent(BaseAlgorithm):
             self.progress.seen_length = max(self.progress.seen_length or 0, len(trajectory))
         self.episodes += len(finished)
 
+    def updates_due(self) -> int:
+        """Return how many updates the collected steps have paid for."""
+        return int(self.credit * self.updates_per_step + 1e-9)  # rounding must not cost one
+
     def update_models(self) -> None:
-        """Make the updates that the collected steps have paid for, and log their means."""
+        """Make the updates that are due, and log their means."""
         if not self.replay_buffer.trajectories or not self.updates_per_step:
             return
-        updates = int(self.credit * self.updates_per_step + 1e-9)  # rounding must not cost one
+        if self.num_timesteps < self.hyperparameters.learning_starts:
+            return
+        updates = self.updates_due()
         price = 1 / self.updates_per_step
-        rest = self.credit - updates * price
+        rest = max(self.credit - updates * price, 0.0)
         metrics: Metrics = defaultdict(list)
         for left in reversed(range(updates)):
             self.update(metrics)

@@ -12,7 +12,7 @@ in the imagination of its own world model.
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,11 +21,12 @@ from torch import Generator, Tensor, nn
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.model.networks import Encoder, Linear, LinearNorm, Size, frozen
-from wpt_agents.model.policy import Dream
+from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent
-from wpt_agents.training.updates import torch_seed
+from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.training.learner import Learner, Metrics
+from wpt_agents.training.randomness import Purpose
 
-RESET = 100  # a purpose of random streams, beside those of `wpt_agents.training.updates`
 MEMBERS = 5  # of the ensemble, as in Plan2Explore
 
 # Keywords of WPT for exploring: nothing to retrieve, nobody to guide, two random episodes first.
@@ -166,117 +167,148 @@ def disagreement(prediction: Tensor) -> Tensor:
     return prediction.var(0, correction=0).mean(-1)
 
 
+class CuriousLearner(Learner):
+    """A learner whose reward is curiosity; `policy.curiosity` is one more network to train."""
+
+    def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
+        super().__init__(policy, hyperparameters)
+        assert isinstance(policy.curiosity, nn.Module)
+        rate = self.hyperparameters.value("learning_rate")
+        self.curiosity_optimizer = self.adam([list(policy.curiosity.parameters())], float(rate))
+
+    def configure(self, hyperparameters: Hyperparameters) -> None:
+        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        super().configure(hyperparameters)
+        rate = self.hyperparameters.value("learning_rate")
+        self.set_rate(self.curiosity_optimizer, float(rate))
+
+
+class ICMLearner(CuriousLearner):
+    """The reward head learns the forward model's error on real transitions."""
+
+    def update_world_model(
+        self, batch: Batch, generator: Generator, learn_reward: bool = False
+    ) -> tuple[Latent, Metrics]:
+        """Train the curiosity on a batch, then the world model with surprise as the reward."""
+        icm = self.policy.curiosity
+        assert isinstance(icm, ICM)
+        within = ~batch.is_first[:, 1:]
+        with self.autocast():
+            read, surprise = icm(batch.image, batch.action)
+            loss = icm_loss(read, batch.action[:, 1:], surprise, within, icm.forward_share)
+        self.descend(self.curiosity_optimizer, loss, "curiosity")
+        icm.scale.see(surprise[within])
+        reward = torch.zeros_like(batch.reward)
+        known = torch.zeros_like(batch.is_first)
+        reward[:, 1:] = icm.scale(surprise.detach())
+        known[:, 1:] = within
+        batch = replace(batch, reward=reward, reward_known=known)
+        post, metrics = super().update_world_model(batch, generator, learn_reward)
+        return post, metrics | {"explore/surprise": surprise.detach().mean()}
+
+
+class Plan2ExploreLearner(CuriousLearner):
+    """The reward of a step is how much an ensemble disagrees on where it leads.
+
+    It is paid on arriving, as the world model's rewards are: in imagination at the states 1 .. H-1,
+    and at the replayed state 0 for the real step that led there, so that the critic's value means
+    the same everywhere. Nothing led to the first state of a replayed sequence, which is paid 0.
+    """
+
+    arrival: Tensor  # (B*T,), the pay of the replayed states, from some of which dreams start
+
+    def update_world_model(
+        self, batch: Batch, generator: Generator, learn_reward: bool = False
+    ) -> tuple[Latent, Metrics]:
+        """Train the world model without the task's reward, then the ensemble on its states."""
+        post, metrics = super().update_world_model(batch, generator)
+        ensemble = self.policy.curiosity
+        assert isinstance(ensemble, Ensemble)
+        within = ~batch.is_first[:, 1:]
+        with self.autocast():
+            with torch.no_grad():
+                embed = self.policy.world_model.encoder(batch.image[:, 1:])
+            prediction = ensemble(post.feat[:, :-1], batch.action[:, 1:])
+            loss = ensemble_loss(prediction, embed, within)
+        self.descend(self.curiosity_optimizer, loss, "curiosity")
+        surprise = disagreement(prediction.detach())
+        ensemble.scale.see(surprise[within])
+        paid = ensemble.scale(surprise) * within
+        self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
+        return post, metrics | {"explore/surprise": surprise[within].mean()}
+
+    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+        """Return the disagreement of the ensemble in a dream, (N, H)."""
+        ensemble = self.policy.curiosity
+        assert isinstance(ensemble, Ensemble)
+        feat = dream.states.feat
+        with frozen(ensemble):
+            surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
+        arrival = self.arrival[starts]
+        assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
+        return torch.cat([arrival[:, None], surprise], 1)
+
+
 class Explorer(WPT):
-    """WPT from scratch whose reward is curiosity; `curiosity` is saved with the policy."""
+    """WPT from scratch whose reward is curiosity; `policy.curiosity` is saved with the policy."""
 
-    curiosity: nn.Module
+    learner_class: ClassVar[type[CuriousLearner]] = CuriousLearner
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.curiosity = self.policy.curiosity = self._make_curiosity().to(self.device)
-        parts = [list(self.curiosity.parameters())]
-        self.curiosity_optimizer = self._optimizer(parts, float(self.learning_rate))
+    def make_policy(self) -> WPTPolicy:
+        """Make all networks, the curiosity included."""
+        policy = super().make_policy()
+        policy.curiosity = self.make_curiosity(policy).to(self.device)
+        return policy
 
-    def _make_curiosity(self) -> nn.Module:
+    def make_curiosity(self, policy: WPTPolicy) -> nn.Module:
+        """Make the network that finds out what is new."""
         raise NotImplementedError
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names, variables = super()._get_torch_save_params()
-        return [*names, "curiosity_optimizer"], variables
+    def make_learner(self) -> CuriousLearner:
+        """Make the optimisers."""
+        return self.learner_class(self.policy, self.hyperparameters)
 
     def explore(self, episodes: int) -> Iterator[Trajectory]:
-        """Plays until there are `episodes`, learning after each; yields each with its rewards.
+        """Collect until there are `episodes`, learning after each; yield each with its rewards.
 
-        An episode is a function of the seed and of what is in the replay buffer, so that a loaded
-        explorer with its episodes added goes on as if it had never stopped.
+        An episode is a function of the seed and of the replay buffer, so that an explorer that was
+        loaded and whose episodes were added continues as if it had never stopped.
         """
         assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
         _, callback = self._setup_learn(
             sys.maxsize // 2, None, reset_num_timesteps=False, tb_log_name="explore"
         )
         while self.episodes < episodes:
-            self.env.seed(torch_seed(self._stream(RESET, self.episodes)))
-            self._last_obs, self._rollout = self.env.reset(), None  # and no half-played episode
+            self.env.seed(self.streams.integer(Purpose.RESET, self.episodes))
+            self._last_obs = self.env.reset()
             self._last_episode_starts = np.ones(1, bool)
-            self._collect(callback, 0)
-            self._update_models()
+            self.rollout = None  # no half-played episode
+            self.collect(callback, 0)
+            self.update_models()
             yield self.replay_buffer.trajectories[-1]
 
 
 class ICMExplorer(Explorer):
-    """The reward head learns the forward model's error on real transitions."""
+    """Explores where an intrinsic curiosity module is surprised."""
 
     saved_as = "ICMExplorer"
-    curiosity: ICM
+    learner_class = ICMLearner
 
-    def _make_curiosity(self) -> ICM:
-        return ICM(self.policy.size, self.max_action_dim)
-
-    def _update_world_model(
-        self,
-        batch: Batch,
-        metrics: dict[str, list[Tensor]],
-        generator: Generator,
-        learn_reward: bool = False,
-    ) -> Latent:
-        icm, within = self.curiosity, ~batch.is_first[:, 1:]
-        with self._autocast():
-            read, surprise = icm(batch.image, batch.action)
-            loss = icm_loss(read, batch.action[:, 1:], surprise, within, icm.forward_share)
-        self._descend(self.curiosity_optimizer, loss, "curiosity")
-        metrics["explore/surprise"].append(surprise.detach().mean())
-        icm.scale.see(surprise[within])
-        reward, known = torch.zeros_like(batch.reward), torch.zeros_like(batch.is_first)
-        reward[:, 1:], known[:, 1:] = icm.scale(surprise.detach()), within
-        batch = replace(batch, reward=reward, reward_known=known)
-        return super()._update_world_model(batch, metrics, generator, learn_reward)
+    def make_curiosity(self, policy: WPTPolicy) -> ICM:
+        """Make inverse and forward model."""
+        return ICM(policy.size, policy.max_action_dim)
 
 
 class Plan2Explore(Explorer):
-    """The reward of a step is how much an ensemble disagrees on where it leads.
-
-    It is paid on arriving, as the world model's rewards are: in imagination at the states 1 .. H-1,
-    and at the replayed state 0 for the real step that led there, so that the critic's value means
-    the same everywhere. Nothing led to the first state of a replayed window, which is paid 0.
-    """
+    """Explores where an ensemble of one-step models disagrees."""
 
     saved_as = "Plan2Explore"
-    curiosity: Ensemble
-    arrival: Tensor  # (B*T,), of the replayed states, some of which the next dream starts from
+    learner_class = Plan2ExploreLearner
 
-    def _make_curiosity(self) -> Ensemble:
-        outputs = self.policy.world_model.encoder.embed_dim
-        return Ensemble(self.policy.size, self.max_action_dim, outputs)
-
-    def _update_world_model(
-        self,
-        batch: Batch,
-        metrics: dict[str, list[Tensor]],
-        generator: Generator,
-        learn_reward: bool = False,
-    ) -> Latent:
-        post = super()._update_world_model(batch, metrics, generator)  # never the task's reward
-        ensemble, within = self.curiosity, ~batch.is_first[:, 1:]
-        with self._autocast():
-            with torch.no_grad():
-                embed = self.policy.world_model.encoder(batch.image[:, 1:])
-            prediction = ensemble(post.feat[:, :-1], batch.action[:, 1:])
-            loss = ensemble_loss(prediction, embed, within)
-        self._descend(self.curiosity_optimizer, loss, "curiosity")
-        surprise = disagreement(prediction.detach())
-        ensemble.scale.see(surprise[within])
-        metrics["explore/surprise"].append(surprise[within].mean())
-        paid = ensemble.scale(surprise) * within
-        self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
-        return post
-
-    def _imagined_reward(self, dream: Dream) -> Tensor:
-        ensemble, feat = self.curiosity, dream.states.feat
-        with frozen(ensemble):
-            surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        arrival = self.arrival[self.starts]
-        assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
-        return torch.cat([arrival[:, None], surprise], 1)
+    def make_curiosity(self, policy: WPTPolicy) -> Ensemble:
+        """Make the ensemble, which predicts the encoded next image."""
+        outputs = policy.world_model.encoder.embed_dim
+        return Ensemble(policy.size, policy.max_action_dim, outputs)
 
 
 EXPLORERS: dict[str, type[Explorer]] = {"icm": ICMExplorer, "plan2explore": Plan2Explore}

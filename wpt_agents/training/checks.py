@@ -1,75 +1,11 @@
 """Refusals: what WPT cannot act in or learn from, each naming what came and what would do."""
 
-from collections.abc import Collection, Mapping
-from numbers import Integral, Real
-from typing import Any
-
 import numpy as np
 import torch
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
-from wpt_agents.files.names import unknown_name
-from wpt_agents.model.networks import find_size
 from wpt_agents.training.spaces import IMAGE_SHAPE
-
-COUNTS = (  # keywords of WPT that count something there must be one of
-    *("max_action_dim", "batch_size", "batch_length", "imagine_horizon"),
-    *("num_retrieve", "bc_steps", "bc_batch_size", "episode_length"),
-)
-OPTIONAL = (  # keywords that may be None
-    *("learning_rate", "actor_critic_learning_rate", "episode_length", "embodiment", "seed"),
-    *("return_norm", "zero_init_heads", "imagine_starts"),
-)
-WHOLE = ("imagine_starts", "actor_delay")  # keywords that must be whole numbers, of at least 0
-SWITCHES = "return_norm", "zero_init_heads", "compile", "data_dependent_init"
-SHARES = ("gamma", "lam", "target_fraction", "unimix", "offline_ratio")
-AMOUNTS = (  # and those that may be 0 but not less
-    *("learning_rate", "actor_critic_learning_rate", "bc_learning_rate", "weight_decay"),
-    *("grad_clip", "ent_coef", "dyn_scale", "rep_scale", "free_nats", "actor_outscale"),
-    *("train_ratio", "learning_starts", "warmup_steps"),
-)
-
-
-CHOICES: dict[str, Collection[str]] = {
-    "precision": ("fp32", "bf16"),
-    "free_nats_mode": ("mean", "element"),
-    "retrieval": ("nearest", "random"),
-    "train_freq": ("episode", "step"),
-}
-
-
-def plain(value: Any) -> Any:
-    """NumPy's numbers as Python's, which a model file can hold."""
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def check_hyperparameters(given: Mapping[str, Any]) -> None:
-    """Refuses values of WPT's keywords that make no sense, each by name.
-
-    :raises ValueError: a count that is no whole number from 1 on, a share outside [0, 1], something
-        else that is no number from 0 on, an unknown choice
-    """
-    find_size(given["size"])
-    for name, value in given.items():
-        if name in OPTIONAL and value is None:
-            continue
-        if name in CHOICES and value not in tuple(CHOICES[name]):
-            raise unknown_name(name, value, CHOICES[name])
-        number = isinstance(value, Real) and not isinstance(value, bool)
-        least = 2 if name == "imagine_horizon" else 1  # the first state's value is no action's
-        if name in COUNTS and not (number and isinstance(value, Integral) and int(value) >= least):
-            raise ValueError(f"{name} is a whole number from {least} on, got {value!r}")
-        if name in WHOLE and not (number and isinstance(value, Integral) and int(value) >= 0):
-            raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
-        if name in SWITCHES and not isinstance(value, bool):
-            raise ValueError(f"{name} is True or False, got {value!r}")
-        if name in SHARES and not (number and 0 <= value <= 1):
-            raise ValueError(f"{name} is a share in [0, 1], got {value!r}")
-        if name == "unimix" and value == 0:
-            raise ValueError("unimix=0 allows latents of probability 0, whose KL is infinite")
-        if name in AMOUNTS and not (number and 0 <= value < np.inf):
-            raise ValueError(f"{name} is a number from 0 on, got {value!r}")
 
 
 def check_device(device: torch.device | str) -> None:

@@ -1,153 +1,104 @@
-"""// Task-Agnostic World Model Pre-Training of Algorithm 1: `WPT.pretrain`, on one device or many.
+"""// Task-Agnostic World Model Pre-Training of Algorithm 1, on one device or many."""
 
-`WPT` inherits `Pretraining`, so that `wpt.py` holds what is done for a task and this module what
-comes before.
-"""
-
-import os
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator
 from contextlib import closing
-from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
-from stable_baselines3.common.type_aliases import GymEnv
-from torch import Tensor
 from tqdm.auto import tqdm
 
-from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
-from wpt_agents.files.model_file import read_model
-from wpt_agents.model.networks import Size
-from wpt_agents.training.distributed import Divided, World, joined, local_device
-from wpt_agents.training.saving import Saving
-from wpt_agents.training.updates import PRETRAIN, Updates, note, torch_seed
+from wpt_agents.training.distributed import Divided, World
+from wpt_agents.training.learner import Learner, Metrics, world_model_metrics
+from wpt_agents.training.randomness import Purpose, Streams, torch_seed
 
-EVERY = 1000  # steps between checkpoints
+EVERY = 1000  # updates between two model files
 
-
-class Pretraining(Updates, Saving):
-    """What `WPT` learns without a task."""
-
-    set_dataset: Callable[[Data | None], None]
-    pretrain_steps: int
-
-    @classmethod
-    def pretrain(
-        cls,
-        dataset: Data,
-        env: GymEnv | str | None = None,
-        steps: int = 200_000,
-        size: str | Size | Mapping[str, Any] = "paper",
-        run_dir: str | os.PathLike[str] | None = None,
-        seed: int | None = None,
-        progress_bar: bool = False,
-        callback: Callable[[int, dict[str, float]], Any] | None = None,
-        accumulate: int = 1,
-        **kwargs: Any,
-    ) -> Self:
-        """Trains a world model on reward-free trajectories of any embodiments, by Eq. (1).
-
-        Started by `torchrun`, the processes divide each batch among them, learn what one would
-        learn from it, and all return the model; rank 0 alone writes, calls back and has the bar.
-
-        :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
-            whatever `TrajectoryDataset.of` takes
-        :param env: the environment to go on with, if known
-        :param steps: updates
-        :param run_dir: `model.zip` is written there every 1000 steps and at the end; if it is
-            there already, training goes on from it, on any number of processes
-        :param callback: called after every update with (step, metrics)
-        :param accumulate: passes over a batch, or a process's share of it, to save memory
-        :param kwargs: keywords of `WPT`; `batch_size` is that of all processes and passes together
-        :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
-            with other images or wider actions; an unknown keyword; a batch that cannot be divided
-        """
-        cls._check_keywords(kwargs)
-        kwargs["device"] = local_device(kwargs.get("device", "auto"))
-        with joined(kwargs["device"]) as world:
-            model: Self = cls(size=size, seed=_common(world, seed), **kwargs)
-            with world.rank_0_first():
-                model.set_dataset(dataset)
-            path = Path(run_dir) / "model.zip" if run_dir is not None else None
-            if path is not None and path.exists():
-                kept = "size", "max_action_dim", "batch_size", "batch_length"
-                model._take(*read_model(path), kept)
-            model._pretrain(world, steps, accumulate, path, progress_bar, callback)
-        if env is not None:
-            model.set_env(env)
-        return model
-
-    def _pretrain(
-        self,
-        world: World,
-        steps: int,
-        accumulate: int,
-        path: Path | None,
-        progress_bar: bool,
-        callback: Callable[[int, dict[str, float]], Any] | None,
-    ) -> None:
-        assert self.dataset is not None
-        done, first = self.pretrain_steps, world.rank == 0
-        told = {"steps": steps, "pretrain_steps": done, "accumulate": accumulate}
-        world.check_same(told | self.hyperparameters | {"dataset": self.dataset.fingerprint})
-        self._initialise(self.dataset)
-        shape = self.batch_size, self.batch_length, self.max_action_dim
-        pin, share = self.device.type == "cuda", world.share(self.batch_size)
-        batches = self.dataset.batches(
-            *shape, self.stream_seed, PRETRAIN, start=done, pin=pin, share=share
-        )
-        update = self._pretrain_update(world, accumulate)
-        hidden = not (progress_bar and first)
-        bar = tqdm(total=steps, initial=done, desc="pre-train", disable=hidden)
-        with bar, closing(batches):
-            for step, batch in zip(range(done, steps), batches, strict=False):
-                metrics: dict[str, list[Tensor]] = defaultdict(list)
-                update(batch, metrics, step)
-                self.pretrain_steps = step + 1
-                if callback is not None and first:
-                    callback(self.pretrain_steps, {k: float(v[0]) for k, v in metrics.items()})
-                if step % 20 == 0:
-                    loss = float(metrics["train/reconstruction_loss"][0])
-                    bar.set_postfix(reconstruction=f"{loss:.1f}")
-                bar.update()
-                if path is not None and ((step + 1) % EVERY == 0 or step + 1 == steps):
-                    if first:
-                        self.save(path)
-                    world.barrier()
-
-    def _pretrain_update(
-        self, world: World, accumulate: int
-    ) -> Callable[[Batch, dict[str, list[Tensor]], int], None]:
-        """An update by number: on a whole batch, or on this process's share in several passes."""
-
-        def whole(batch: Batch, metrics: dict[str, list[Tensor]], step: int) -> None:
-            generator = self._generator(PRETRAIN, step)
-            self._update_world_model(batch.to(self.device), metrics, generator)
-
-        def share(batch: Batch, metrics: dict[str, list[Tensor]], step: int) -> None:
-            self.model_optimizer.zero_grad()
-            seed = torch_seed(self._stream(PRETRAIN, step))
-            loss = divided.backward(batch, self.device, seed)
-            norm = self._step(self.model_optimizer, loss.total, "world model")
-            note(metrics, loss, norm)
-
-        if world.size == accumulate == 1:
-            return whole
-        divided = Divided(
-            self.policy.world_model,
-            world,
-            accumulate,
-            self.batch_size,
-            self._autocast,
-            self._eq_1_options,
-        )
-        return share
+Update = Callable[[Batch, int], Metrics]  # called with a batch and the update's number
 
 
-def _common(world: World, seed: int | None) -> int | None:
-    """The seed given; where several processes got none, the same new one for all."""
+def world_model_updates(
+    learner: Learner,
+    dataset: TrajectoryDataset,
+    streams: Streams,
+    world: World,
+    start: int,
+    steps: int,
+    accumulate: int = 1,
+    progress_bar: bool = False,
+) -> Generator[Metrics, None, None]:
+    """Train a world model on reward-free trajectories by Eq. (1); yield each update's metrics.
+
+    Batch k depends on the seed and k alone, so that training that is interrupted continues exactly.
+
+    :param world: the processes that share the work; a batch is divided among them
+    :param start: updates that were made before
+    :param steps: updates in all
+    :param accumulate: passes over a batch, or a process's share of it, to save memory
+    """
+    settings = learner.hyperparameters
+    batches = dataset.batches(
+        settings.batch_size,
+        settings.batch_length,
+        settings.max_action_dim,
+        streams.seed,
+        Purpose.PRETRAIN,
+        start=start,
+        pin=learner.policy.device.type == "cuda",
+        share=world.share(settings.batch_size),
+    )
+    if world.size == accumulate == 1:
+        update = whole_update(learner, streams)
+    else:
+        update = divided_update(learner, streams, world, accumulate)
+    shown = progress_bar and world.rank == 0
+    bar = tqdm(total=steps, initial=start, desc="pre-train", disable=not shown)
+    with bar, closing(batches):
+        for step, batch in zip(range(start, steps), batches, strict=False):
+            metrics = update(batch, step)
+            yield metrics
+            if step % 20 == 0:
+                loss = float(metrics["train/reconstruction_loss"])
+                bar.set_postfix(reconstruction=f"{loss:.1f}")
+            bar.update()
+
+
+def whole_update(learner: Learner, streams: Streams) -> Update:
+    """Return an update on a whole batch."""
+    device = learner.policy.device
+
+    def update(batch: Batch, step: int) -> Metrics:
+        generator = streams.torch(Purpose.PRETRAIN, step, device)
+        return learner.update_world_model(batch.to(device), generator)[1]
+
+    return update
+
+
+def divided_update(learner: Learner, streams: Streams, world: World, accumulate: int) -> Update:
+    """Return an update on this process's share of a batch, in several passes."""
+    settings = learner.hyperparameters
+    divided = Divided(
+        learner.policy.world_model,
+        world,
+        accumulate,
+        settings.batch_size,
+        learner.autocast,
+        learner.eq_1_options,
+    )
+
+    def update(batch: Batch, step: int) -> Metrics:
+        optimizer = learner.model_optimizer
+        optimizer.zero_grad()
+        seed = streams.integer(Purpose.PRETRAIN, step)
+        loss = divided.backward(batch, learner.policy.device, seed)
+        norm = learner.take_step(optimizer, loss.total, "world model")
+        return world_model_metrics(loss, norm)
+
+    return update
+
+
+def common_seed(world: World, seed: int | None) -> int | None:
+    """Return the seed, or if several processes have none, the same new one for all."""
     if seed is None and world.size > 1:
         return world.rank_0s(torch_seed(np.random.default_rng()))
     return seed

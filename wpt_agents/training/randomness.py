@@ -21,6 +21,7 @@ class Purpose(IntEnum):
     WARMUP = 4
     ACT = 5
     RETRIEVE = 6
+    INITIALISE = 7
     REDRAW = 8  # of the networks, for the next task of a sequence
     RESET = 100  # of the environment, before an explorer's episode
 

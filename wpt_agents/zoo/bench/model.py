@@ -1,15 +1,14 @@
 """The gradient steps: world model alone, and all networks."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Batch
-from wpt_agents.training.updates import UPDATE
+from wpt_agents.training.randomness import Purpose
 from wpt_agents.zoo.bench.timing import (
     cost,
     forget_peak,
@@ -147,14 +146,14 @@ def synthetic_batch(batch: int, length: int) -> Batch:
 
 def world_model_step(model: WPT, batch: Batch, learn_reward: bool = False) -> Callable[[], Any]:
     """A pre-training step on `batch`; with `learn_reward` the reward head learns too."""
-
-    def step() -> None:
-        metrics: dict[str, list[Tensor]] = defaultdict(list)
-        model._update_world_model(batch, metrics, model._generator(UPDATE, 0), learn_reward)
-
-    return step
+    return lambda: model.learner.update_world_model(batch, generator(model), learn_reward)
 
 
 def whole_step(model: WPT, batch: Batch) -> Callable[[], Any]:
     """`WPT.update` on `batch`: world model, reward, imagination, actor and critic."""
-    return lambda: model._update_on(batch, defaultdict(list))
+    return lambda: model.learner.update(batch, generator(model))
+
+
+def generator(model: WPT) -> torch.Generator:
+    """Return the random numbers of a model's first update."""
+    return model.streams.torch(Purpose.UPDATE, 0, model.device)

@@ -23,7 +23,7 @@ from wpt_agents.agents.curious import EXPLORE, EXPLORERS
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import unknown_name
-from wpt_agents.training.checks import check_hyperparameters
+from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.curious import Expedition, explore_each
 from wpt_agents.zoo.collect.episodes import (
     SIGMAS,
@@ -210,7 +210,7 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
 
 def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
     if behaviour != STATE_CURIOSITY:
-        check_hyperparameters({**EXPLORE, **settings})
+        Hyperparameters.of({**EXPLORE, **settings})
         return
     for name, value in settings.items():
         if name not in EXPLORATION_KEYWORDS:

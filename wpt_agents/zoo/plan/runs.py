@@ -14,8 +14,8 @@ from wpt_envs.tasks import Task
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import unknown_name
-from wpt_agents.training.checks import check_hyperparameters
 from wpt_agents.training.guidance import ever, parse_schedule
+from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset, wpt_keywords
@@ -214,7 +214,7 @@ def action_widths(suite: str, preset: Preset, data: Path | None) -> set[int]:
 
 def check_preset(preset: Preset) -> None:
     """Refuse values that the presets' types allow and the stages do not."""
-    check_hyperparameters({**wpt_keywords(), **preset.wpt})
+    Hyperparameters.of(preset.wpt)
     for name, value, known in (
         ("env.rendering", preset.env.rendering, QUALITIES),
         ("collect.behaviour", preset.collect.behaviour, set(BEHAVIOURS) - {"policy"}),

@@ -17,25 +17,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.hyperparameters import FINE_TUNING
 from wpt_agents.training.keywords import Stage
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.tasks import find_tasks
-
-# Keywords of WPT that pre-training does not look at: changing them keeps the pre-trained model.
-FINE_TUNING = {
-    *("actor_critic_learning_rate", "gamma", "lam", "ent_coef", "imagine_horizon", "return_norm"),
-    *(
-        "target_fraction",
-        "train_ratio",
-        "train_freq",
-        "learning_starts",
-        "warmup_steps",
-        "guidance",
-        "kickstart",
-    ),
-    *("offline_ratio", "retrieval", "num_retrieve", "imagine_starts", "actor_delay"),
-    *("bc_steps", "bc_batch_size", "bc_learning_rate"),
-}
 
 
 def key(*parts: Any) -> str:

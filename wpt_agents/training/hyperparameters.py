@@ -1,0 +1,232 @@
+"""The keywords of WPT: Table 2 of the paper, once, with what the paper has not.
+
+A new keyword is declared here and used in one other place. The signature of `WPT`, its attributes,
+its documentation, its checks and the zoo's list of what pre-training depends on follow from it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from wpt_agents.model.behavior_cloning import FRAMES
+from wpt_agents.model.sizes import Size, find_size, plain_size
+from wpt_agents.training.guidance import ever, parse_schedule
+from wpt_agents.training.keywords import (
+    Keywords,
+    Stage,
+    amount,
+    choice,
+    count,
+    keyword,
+    schedule,
+    share,
+    switch,
+)
+
+SIZES_OWN = {  # keywords that are the size's own if None, and the fields of `Size` to read
+    "learning_rate": "learning_rate",
+    "actor_critic_learning_rate": "actor_critic_learning_rate",
+    "imagine_starts": "imagine_starts",
+    "zero_init_heads": "stabilised",
+    "return_norm": "stabilised",
+}
+
+
+def check_size(name: str, value: Any) -> None:
+    """Refuse what is no size."""
+    find_size(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hyperparameters(Keywords):
+    """The keywords of WPT. Steps are calls of `env.step` (2 frames each at action repeat 2)."""
+
+    # The networks.
+    size: str | Size | Mapping[str, Any] = keyword(  # noqa: RUF009  # a field, as the others are
+        "paper",
+        check_size,
+        "widths of all networks: debug, tiny, mid, small, medium, paper, or a `Size` or its fields",
+        Stage.SIZE,
+    )
+    max_action_dim: int = count(12, "A, the width that all actions are padded to", Stage.SIZE)
+    unimix: float = share(
+        0.01,
+        "share of the uniform distribution in the latents' distributions. At 0 the KL of a latent "
+        "of probability 0 would be infinite",
+        Stage.SIZE,
+        positive=True,
+    )
+    zero_init_heads: bool | None = switch(
+        None, "start reward head and critic at zero; the size's own if None", Stage.SIZE
+    )
+    actor_outscale: float = amount(
+        1.0, "factor on the initial weights of the actor's last layer", Stage.SIZE
+    )
+    data_dependent_init: bool = switch(
+        True,
+        "before the first update of a new world model, standardise what its posterior sees by 512 "
+        "images of the data",
+        Stage.SIZE,
+    )
+    compile: bool = switch(
+        False,
+        "let `torch.compile` fuse the steps of scan and dream, for a GPU. The first updates take "
+        "minutes, and numbers differ in rounding",
+        Stage.SIZE,
+    )
+
+    # The world model, in pre-training and in fine-tuning.
+    batch_size: int = count(16, "B, sequences in a batch", Stage.PRETRAINING)
+    batch_length: int = count(64, "T, images in a sequence", Stage.PRETRAINING)
+    learning_rate: float | None = amount(
+        None, "of world model and reward head; the size's own if None", Stage.PRETRAINING
+    )
+    weight_decay: float = amount(
+        1e-6, "share by which every weight shrinks in a step", Stage.PRETRAINING
+    )
+    grad_clip: float = amount(
+        100.0, "largest norm of the gradient of each network", Stage.PRETRAINING
+    )
+    dyn_scale: float = amount(1.0, "weight of the KL that trains the prior", Stage.PRETRAINING)
+    rep_scale: float = amount(0.1, "weight of the KL that trains the posterior", Stage.PRETRAINING)
+    free_nats: float = amount(1.0, "KL below which it trains nothing", Stage.PRETRAINING)
+    free_nats_mode: str = choice(
+        "mean", ("mean", "element"), '"mean" (WPT) or "element" (DreamerV3)', Stage.PRETRAINING
+    )
+    precision: str = choice(
+        "fp32",
+        ("fp32", "bf16"),
+        '"fp32", or "bf16" for the forward passes; on a CPU it pays from `small` on',
+        Stage.PRETRAINING,
+    )
+
+    # Actor and critic.
+    actor_critic_learning_rate: float | None = amount(
+        None, "of actor and critic; the size's own if None"
+    )
+    gamma: float = share(0.99, "discount factor")
+    lam: float = share(0.95, "λ of Eq. (2)")
+    ent_coef: float = amount(1e-4, "η of Eq. (4), the weight of the entropy")
+    imagine_horizon: int = count(  # the value of the first state is no action's
+        16, "H, imagined steps", least=2
+    )
+    imagine_starts: int | None = count(
+        None,
+        "replayed states of a batch from which actor and critic imagine, drawn at random; 0 for "
+        "all of them, as in the paper; the size's own if None",
+        least=0,
+    )
+    target_fraction: float = share(
+        0.02, "share by which the target critic moves to the critic in an update"
+    )
+    return_norm: bool | None = switch(
+        None, "divide returns by their 5-95 % range, if above 1; the size's own if None"
+    )
+    train_ratio: float = amount(
+        256, "replayed steps for each collected step; one update replays B x T of them"
+    )
+    offline_ratio: float = share(0.25, "share of retrieved sequences in a batch; 0: no rehearsal")
+    kickstart: str | float = schedule(
+        0.0,
+        np.inf,
+        "weight, or schedule of it, of a loss by which the actor imitates the prior actor on the "
+        "replayed images; not in the paper. 0: off; where the clone is good, try 20",
+    )
+    actor_delay: int = count(
+        0,
+        "updates of a head start, made when `learning_starts` is reached even if fewer have been "
+        "earned: reward head and critic learn while the actor only imitates the prior actor; not "
+        "in the paper",
+        least=0,
+    )
+
+    # Collecting.
+    learning_starts: int = count(
+        5_000,
+        "steps that are collected before the first update; they earn updates, too",
+        Stage.ACTING,
+        least=0,
+    )
+    warmup_steps: int = count(
+        7_500,
+        "steps that the prior actor alone drives (uniform random actions without one)",
+        Stage.ACTING,
+        least=0,
+    )
+    guidance: str | float = schedule(
+        "linear(1,0,50000)",
+        1.0,
+        "schedule of the probability that an episode is guided; 0: no guidance",
+        Stage.ACTING,
+    )
+    episode_length: int | None = count(
+        None,
+        "steps of an episode, for the guidance window; that of the longest episode if None",
+        Stage.ACTING,
+    )
+    embodiment: str | None = keyword(
+        None,
+        Keywords.declared()["embodiment"].check,
+        "name of the robot; retrieval uses only data of this name or of none, and warns if there "
+        "is none",
+        Stage.ACTING,
+    )
+
+    # Retrieval and the prior actor.
+    num_retrieve: int = count(500, "R, trajectories to retrieve", Stage.RETRIEVAL)
+    retrieval: str = choice(
+        "nearest",
+        ("nearest", "random"),
+        '"nearest", by Eq. (5), or "random", its ablation',
+        Stage.RETRIEVAL,
+    )
+    bc_steps: int = count(150_000, "updates of the prior actor", Stage.CLONING)
+    bc_batch_size: int = count(
+        256, "images and actions in an update of the prior actor", Stage.CLONING
+    )
+    bc_learning_rate: float = amount(
+        1e-4, "of the prior actor at its first update; it falls linearly to 0", Stage.CLONING
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "size", plain_size(self.size))
+        if self.imitates and self.batch_length < FRAMES:
+            raise ValueError(
+                f"kickstart looks at {FRAMES} images in a row, but batch_length="
+                f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
+            )
+
+    def value(self, name: str) -> Any:
+        """Return a keyword's value, the size's own where it is None."""
+        found = getattr(self, name)
+        if found is None and name in SIZES_OWN:
+            return getattr(find_size(self.size), SIZES_OWN[name])
+        return found
+
+    def resolved(self) -> Self:
+        """Return a copy in which the size's own values stand where None stood."""
+        return self.changed(**{name: self.value(name) for name in SIZES_OWN})
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the actor ever imitates the prior actor in its loss."""
+        return ever(parse_schedule(self.kickstart, np.inf, "kickstart"))
+
+    @property
+    def needs_clone(self) -> bool:
+        """Whether the prior actor will ever act or be imitated."""
+        return self.imitates or ever(parse_schedule(self.guidance))
+
+    def guidance_at(self, step: int) -> float:
+        """Return the probability that an episode that begins at this step is guided."""
+        return parse_schedule(self.guidance)(step)
+
+    def kickstart_at(self, step: int) -> float:
+        """Return the weight of the imitation loss at this step."""
+        return parse_schedule(self.kickstart, np.inf, "kickstart")(step)
+
+
+FINE_TUNING = Hyperparameters.of_stages(*(set(Stage) - {Stage.SIZE, Stage.PRETRAINING}))

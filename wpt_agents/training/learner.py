@@ -1,0 +1,252 @@
+"""// Update Models of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
+
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.optim import Optimizer
+
+import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
+
+from wpt_agents.data.trajectory import Batch
+from wpt_agents.model.actor_critic import (
+    actor_loss,
+    critic_loss,
+    draw_starts,
+    ema_update,
+    lambda_return,
+    return_range,
+)
+from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, recent_frames
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.policy import Dream, WPTPolicy
+from wpt_agents.model.rssm import Latent, over_steps
+from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
+from wpt_agents.training import descent
+from wpt_agents.training.hyperparameters import Hyperparameters
+
+Metrics = dict[str, Tensor]  # scalars without gradient, by their names in the log
+
+
+class Imagined(NamedTuple):
+    """Dreams and what they promise: N starts, H steps."""
+
+    dream: Dream
+    reward: Tensor  # (N, H)
+    value: Tensor  # (N, H + 1), of the target critic
+    returns: Tensor  # (N, H), Eq. (2)
+
+
+class Learner:
+    """The optimisers of a policy's networks, and the updates that they make.
+
+    Example::
+
+        learner = Learner(policy, Hyperparameters(size="tiny"))
+        metrics = learner.update(batch, generator)
+
+    :param policy: whose networks learn
+    :param hyperparameters: rates, weights and clips
+    """
+
+    def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
+        self.policy = policy
+        self.hyperparameters = hyperparameters.resolved()
+        model = policy.world_model
+        rate = float(self.hyperparameters.value("learning_rate"))
+        actor_critic_rate = self.hyperparameters.value("actor_critic_learning_rate")
+        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
+        self.model_optimizer = self.adam(parts, rate)
+        self.actor_optimizer = self.adam([list(policy.actor.parameters())], actor_critic_rate)
+        self.critic_optimizer = self.adam([list(policy.critic.parameters())], actor_critic_rate)
+
+    def adam(self, parts: list[list[nn.Parameter]], rate: float) -> Optimizer:
+        """Make an optimiser over parts whose gradients are clipped separately."""
+        return descent.adam(parts, rate, self.hyperparameters.weight_decay)
+
+    def configure(self, hyperparameters: Hyperparameters) -> None:
+        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        self.hyperparameters = hyperparameters.resolved()
+        rate = float(self.hyperparameters.value("learning_rate"))
+        actor_critic_rate = self.hyperparameters.value("actor_critic_learning_rate")
+        self.set_rate(self.model_optimizer, rate)
+        self.set_rate(self.actor_optimizer, actor_critic_rate)
+        self.set_rate(self.critic_optimizer, actor_critic_rate)
+
+    def set_rate(self, optimizer: Optimizer, rate: float) -> None:
+        """Set an optimiser's learning rate and weight decay."""
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+            group["weight_decay"] = descent.decay(rate, self.hyperparameters.weight_decay)
+
+    def update(
+        self,
+        batch: Batch,
+        generator: Generator,
+        imitation_weight: float = 0.0,
+        head_start: bool = False,
+    ) -> Metrics:
+        """Train world model and reward head on a batch, actor and critic on dreams from its states.
+
+        :param imitation_weight: of the loss by which the actor imitates the prior actor
+        :param head_start: train the actor on nothing but that imitation
+        """
+        post, metrics = self.update_world_model(batch, generator, learn_reward=True)
+        imitation = None
+        if imitation_weight:
+            loss = self.imitation_loss(post, batch)
+            metrics["train/kickstart_loss"] = loss.detach()
+            imitation = imitation_weight * loss
+        starts = self.draw_starts(batch, generator)
+        start = post.flatten_time().pick(starts)
+        metrics |= self.update_behavior(start, starts, generator, imitation, head_start)
+        return metrics
+
+    def update_world_model(
+        self, batch: Batch, generator: Generator, learn_reward: bool = False
+    ) -> tuple[Latent, Metrics]:
+        """Take a step on Eq. (1), and on the reward likelihood of states that it leaves alone.
+
+        :return: the posterior states (B, T, ...), without gradient
+        """
+        model = self.policy.world_model
+        metrics: Metrics = {}
+        with self.autocast():
+            loss, post = world_model_update_loss(model, batch, generator, **self.eq_1_options)
+            total = loss.total
+            if learn_reward:
+                logits = model.reward_head(post.feat.detach())
+                reward = reward_loss(logits, batch.reward, batch.reward_known)
+                total = total + reward
+                metrics["train/reward_loss"] = reward.detach()
+        norm = self.descend(self.model_optimizer, total, "world model")
+        return post.detach(), metrics | world_model_metrics(loss, norm)
+
+    @property
+    def eq_1_options(self) -> dict[str, Any]:
+        """The keywords of `world_model_loss`."""
+        names = ("dyn_scale", "rep_scale", "free_nats", "free_nats_mode")
+        return {name: getattr(self.hyperparameters, name) for name in names}
+
+    def imitation_loss(self, post: Latent, batch: Batch) -> Tensor:
+        """Kickstarting: how far the actor is from the prior actor on the replayed images.
+
+        The paper does not have it. Source: https://arxiv.org/abs/1803.03835
+        """
+        policy = self.policy
+        mask = policy.action_mask
+        seen = recent_frames(batch.image, batch.is_first).flatten(0, 1)
+        feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
+        with self.autocast():
+            with torch.no_grad():
+                advice = policy.prior_actor.act(seen, mask)
+            return bc_loss(policy.actor.dist(feat, mask).mode, advice, mask)
+
+    def draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
+        """Return the numbers of the batch's states to imagine from, (N,)."""
+        number = self.hyperparameters.value("imagine_starts")
+        rows, length = batch.is_first.shape
+        return draw_starts(rows, length, number, generator, self.policy.device)
+
+    def update_behavior(
+        self,
+        start: Latent,
+        starts: Tensor,
+        generator: Generator,
+        imitation: Tensor | None = None,
+        head_start: bool = False,
+    ) -> Metrics:
+        """Train actor and critic on imagined trajectories, Eq. (2) to (4).
+
+        During the head start (`actor_delay`) the actor's loss is the imitation alone, and without a
+        prior actor it is not updated: reward head and critic first learn what the dreams are worth.
+
+        :param start: (N, ...), the states to start from
+        :param starts: (N,), their numbers in the batch
+        :param imitation: added to the actor's loss, but not to the metric of it
+        """
+        policy = self.policy
+        settings = self.hyperparameters
+        with self.autocast(), torch.set_grad_enabled(not head_start):
+            dream, reward, value, returns = self.imagine(start, starts, generator)
+            spread, scale = self.return_scale(returns)
+            loss = actor_loss(returns, dream.entropy, settings.ent_coef, settings.gamma, scale)
+        terms = [] if head_start else [loss]
+        terms += [] if imitation is None else [imitation]
+        actor_norm = torch.zeros_like(scale)
+        if terms:
+            actor_norm = self.descend(self.actor_optimizer, sum(terms[1:], terms[0]), "actor")
+        policy.return_scale.copy_(spread)  # now that it is known to be finite
+        with self.autocast():
+            logits = over_steps(policy.critic, dream.states.detach().but_last())
+            value_loss = critic_loss(logits, returns, settings.gamma)
+        critic_norm = self.descend(self.critic_optimizer, value_loss, "critic")
+        ema_update(policy.target_critic, policy.critic, settings.target_fraction)
+        metrics = {
+            "actor_loss": loss,
+            "critic_loss": value_loss,
+            "value": value.mean(),
+            "imagined_reward": reward.mean(),
+            "entropy": dream.entropy.mean(),
+            "saturated_actions": dream.saturated,
+            "return_scale": scale,
+            "actor_grad_norm": actor_norm,
+            "critic_grad_norm": critic_norm,
+        }
+        return {f"train/{name}": tensor.detach() for name, tensor in metrics.items()}
+
+    def imagine(self, start: Latent, starts: Tensor, generator: Generator) -> Imagined:
+        """Dream from some states and compute what the dreams are worth, Eq. (2)."""
+        settings = self.hyperparameters
+        dream = self.policy.dream(start, settings.imagine_horizon, generator)
+        reward = self.imagined_reward(dream, starts)
+        value = over_steps(self.policy.target_critic.value, dream.states)
+        returns = lambda_return(reward, value, settings.gamma, settings.lam)
+        return Imagined(dream, reward, value, returns)
+
+    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+        """Return what arriving in the imagined states 0 .. H-1 pays, (N, H).
+
+        :param starts: (N,), the numbers of the dreams' first states in the batch
+        """
+        model = self.policy.world_model
+        with frozen(model):
+            return over_steps(model.reward, dream.states.but_last())
+
+    def return_scale(self, returns: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the running 5-95 % range of the returns, and what they are divided by."""
+        before = self.policy.return_scale
+        if not self.hyperparameters.value("return_norm"):
+            return torch.ones_like(before), torch.ones_like(before)
+        width = return_range(returns)
+        unknown = before == 0  # these are the first returns
+        spread = torch.where(unknown, width, before.lerp(width, 0.01))
+        return spread, spread.clamp_min(1.0)
+
+    def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """Take a step on a loss; return the gradient's norm before clipping."""
+        norm = descent.descend(optimizer, loss, name, self.hyperparameters.grad_clip)
+        self.policy.updates += 1  # cached copies of the weights are out of date
+        return norm
+
+    def take_step(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """Take a step on gradients that were computed; return their norm before clipping."""
+        norm = descent.take_step(optimizer, loss, name, self.hyperparameters.grad_clip)
+        self.policy.updates += 1
+        return norm
+
+    def autocast(self) -> AbstractContextManager[None]:
+        """Return the context of a forward pass, by the keyword `precision`."""
+        bf16 = self.hyperparameters.precision == "bf16"
+        kind = self.policy.device.type
+        return torch.autocast(kind, torch.bfloat16, enabled=bf16, cache_enabled=True)
+
+
+def world_model_metrics(loss: WorldModelLoss, norm: Tensor) -> Metrics:
+    """Return the metrics of a step on Eq. (1)."""
+    return {
+        "train/reconstruction_loss": loss.reconstruction.detach(),
+        "train/kl": loss.kl,
+        "train/world_model_grad_norm": norm,
+    }

@@ -1,7 +1,6 @@
 """Curiosity: the losses by hand, surprise where nothing was seen, and agents that go on exactly."""
 
 import copy
-from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np

@@ -97,7 +97,7 @@ def test_a_size_without_a_name_is_saved_with_its_fields(tmp_path, as_fields):
 
 def test_a_size_equal_to_a_named_one_is_saved_by_its_name(tmp_path):
     model = agent(size=replace(SIZES["tiny"]))
-    assert model.hyperparameters["size"] == model.size == "tiny"
+    assert model.hyperparameters.size == model.size == "tiny"
 
 
 def test_a_dotted_name_never_loads_another_file(tmp_path):
@@ -113,7 +113,7 @@ def test_a_folder_is_refused_with_the_files_it_holds(tmp_path):
         WPT.load(run)
     for name in ("model", "best_model"):
         agent(ClockEnv()).save(run / name)
-    with pytest.raises(FileNotFoundError, match=r"holds best_model.zip, model.zip: give the file"):
+    with pytest.raises(FileNotFoundError, match=r"holds best_model.zip, model.zip: pass the file"):
         WPT.load(run)
     agent(ClockEnv(), gamma=0.8).save(tmp_path / "walker_0")  # beside the folder
     assert WPT.load(tmp_path / "walker_0").gamma == 0.8

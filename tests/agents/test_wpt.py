@@ -182,7 +182,9 @@ def test_retrieval_keeps_to_the_embodiment_when_the_data_names_it(store):
 
 def test_a_robot_that_the_data_do_not_name_is_told_and_gets_any_of_its_width(store):
     model = pretrained(store, env=DotEnv(), num_retrieve=9, embodiment="crab")
-    with pytest.warns(UserWarning, match=r"bears the name 'crab' \(dot, wide\).*of 2 actions"):
+    with pytest.warns(
+        UserWarning, match=r"no robot of the name 'crab' \(it has dot, wide\).*of 2 actions"
+    ):
         model.learn(1)
     assert sorted(model.retrieved_ids) == [0, 1, 2, 3]
 
@@ -386,14 +388,13 @@ def test_the_head_start_is_made_at_once_and_what_was_earned_counts_towards_it():
 def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):
     rates = []
     model = pretrained(store, env=DotEnv(), guidance=1, bc_steps=4, bc_learning_rate=0.1)
-    descend = model._descend
+    descend = cloning.descend
 
-    def note_rate(optimizer, loss, name):
-        if name == "bc":
-            rates.append(optimizer.param_groups[0]["lr"])
-        return descend(optimizer, loss, name)
+    def note_rate(optimizer, *args):
+        rates.append(optimizer.param_groups[0]["lr"])
+        return descend(optimizer, *args)
 
-    monkeypatch.setattr(model, "_descend", note_rate)
+    monkeypatch.setattr(cloning, "descend", note_rate)
     model.learn(1)
     assert rates == pytest.approx([0.1, 0.075, 0.05, 0.025])
 
@@ -608,7 +609,7 @@ def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_
     model.learn(7)
     assert model.expected_length() == 7
     model.save(tmp_path / "model")
-    assert WPT.load(tmp_path / "model", env=ClockEnv(length=7))._episode_length() == 7
+    assert WPT.load(tmp_path / "model", env=ClockEnv(length=7)).expected_length() == 7
     model.reset_task()
     assert model.expected_length() == 500
 

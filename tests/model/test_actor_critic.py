@@ -307,7 +307,7 @@ def test_rewards_teach_the_reward_head_and_leave_the_world_model_alone():
 def test_weight_decay_takes_the_same_share_whatever_the_learning_rate(rate):
     model = agent(learning_rate=rate, actor_critic_learning_rate=rate / 2, weight_decay=0.25)
     for name in ("model_optimizer", "actor_optimizer", "critic_optimizer"):
-        optimizer = getattr(model, name)
+        optimizer = getattr(model.learner, name)
         weights = optimizer.param_groups[0]["params"]
         before = [p.detach().clone() for p in weights]
         for parameter in weights:
@@ -318,7 +318,7 @@ def test_weight_decay_takes_the_same_share_whatever_the_learning_rate(rate):
 
 def test_the_default_decay_is_a_millionth():
     model = agent()
-    for optimizer in (model.model_optimizer, model.actor_optimizer, model.critic_optimizer):
+    for optimizer in optimizers(model.learner).values():
         group = optimizer.param_groups[-1]
         assert group["lr"] * group["weight_decay"] == pytest.approx(1e-6)
         assert group["eps"] == 1e-5

@@ -23,8 +23,8 @@ from wpt_envs.tasks import TASKS, Task
 from zoo_command import call
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.training.learner import Learner
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.learner import Learner
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
 from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy

@@ -20,8 +20,8 @@ from stable_baselines3.common.logger import configure
 from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.training.learner import Learner
 from wpt_agents.files.model_file import read_model
+from wpt_agents.training.learner import Learner
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
 from wpt_agents.zoo.run import learning, locks, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint

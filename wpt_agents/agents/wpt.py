@@ -31,8 +31,8 @@ from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.fast.compiled import compile_loops
 from wpt_agents.files.model_file import read_model
-from wpt_agents.model.sizes import Size, find_size
 from wpt_agents.model.policy import PriorPolicy, WPTPolicy, prior_action, to_images
+from wpt_agents.model.sizes import Size, find_size
 from wpt_agents.training import pretraining
 from wpt_agents.training.checks import check_dataset, check_trajectory
 from wpt_agents.training.cloning import Cloning, clone
@@ -393,10 +393,10 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         return super().too_late(stage)
 
     def hyperparameters_changed(self) -> None:
-        """Let the learner use the changed keywords."""
-        self.learner.configure(self.hyperparameters)
+        """Let the learner use the changed keywords, if they suit the dataset."""
         if self.dataset is not None:
             self.check_data(self.dataset)
+        self.learner.configure(self.hyperparameters)
 
     # What a model can show
 

@@ -8,7 +8,6 @@ from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 
 import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
-
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
     actor_loss,

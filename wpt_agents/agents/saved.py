@@ -1,0 +1,294 @@
+"""What every agent keeps: keywords, random numbers, environment, model files and copies."""
+
+import os
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import get_system_info
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from torch import Tensor
+
+from wpt_agents.agents.attributes import KeywordAgent
+from wpt_agents.data.convert import Data, open_dataset
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.files.model_file import read_model
+from wpt_agents.files.names import unknown_name
+from wpt_agents.model.actions import space_as_dict, space_from_dict
+from wpt_agents.model.policy import IMAGE_SPACE
+from wpt_agents.training import model_files
+from wpt_agents.training.checks import check_device
+from wpt_agents.training.environments import as_vec_env
+from wpt_agents.training.randomness import Streams, torch_seed
+from wpt_agents.training.rollout import Rollout
+from wpt_agents.training.spaces import check_spaces
+
+
+class SavedAgent(KeywordAgent):
+    """An SB3 algorithm that is made of a policy, a learner, keywords and counters.
+
+    `PixelAgent` adds how it collects and learns.
+
+    :param policy: the policy's name or class; the first of `policy_aliases` if None
+    :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
+    :param dataset: trajectories to learn from: whatever `open_dataset` takes
+    :param tensorboard_log: folder of the TensorBoard events
+    :param verbose: 0 for nothing, 1 for information
+    :param device: "auto", "cpu", "cuda", ...
+    """
+
+    saved_as: ClassVar[str] = ""  # the class that reads the model files, if not the class itself
+    shape_keywords: ClassVar[tuple[str, ...]] = ()  # must be equal where weights are loaded
+
+    policy: Any  # a BasePolicy with the methods of `training.rollout.Acting`
+    learner: Any
+    action_space: spaces.Box
+    _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
+    _last_episode_starts: Any
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | None = None,
+        env: GymEnv | str | None = None,
+        *,
+        dataset: Data | None = None,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+        **keywords: Any,
+    ) -> None:
+        if unknown := keywords.keys() - self.keywords.declared().keys():
+            raise TypeError(str(unknown_name("keyword", min(unknown), self.keywords.declared())))
+        check_device(device)
+        self.hyperparameters = self.keywords(**keywords)
+        self.progress = self.progress_class()
+        seed = self.hyperparameters.seed
+        self.streams = Streams(torch_seed(np.random.default_rng()) if seed is None else seed)
+        rate = getattr(self.hyperparameters, "learning_rate", 0.0)
+        super().__init__(
+            policy or next(iter(self.policy_aliases)),
+            None,
+            learning_rate=rate,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.dataset: TrajectoryDataset | None = None
+        self.replay_buffer = ReplayBuffer()
+        self.rollout: Rollout | None = None
+        self.observation_space = IMAGE_SPACE
+        self.n_envs = 1
+        wrapped = None if env is None else self._checked(env)
+        if wrapped is not None:
+            assert isinstance(wrapped.action_space, spaces.Box)
+            self.action_space = wrapped.action_space
+        elif _init_setup_model:
+            self.action_space = self.unbound_action_space()
+        if _init_setup_model:
+            self._setup_model()
+        self.set_dataset(dataset)
+        if wrapped is not None:
+            self._use_env(wrapped)
+
+    def _setup_model(self) -> None:
+        self.set_random_seed(self.hyperparameters.seed)
+        self.policy = self.make_policy().to(self.device)
+        self.learner = self.make_learner()
+
+    @abstractmethod
+    def make_policy(self) -> Any:
+        """Make the policy for `self.observation_space` and `self.action_space`."""
+
+    @abstractmethod
+    def make_learner(self) -> Any:
+        """Make what updates `self.policy`, with new optimisers."""
+
+    def unbound_action_space(self) -> spaces.Box:
+        """Return the action space of an agent that was made without an environment."""
+        raise ValueError(f"{type(self).__name__} needs an environment: pass env=")
+
+    def reset_task(self) -> None:
+        """Forget the task: the episodes, and the networks that `reset_behavior` draws again."""
+        self.replay_buffer = ReplayBuffer()
+        self.progress.reset("credit", "seen_length")
+        self.rollout = None
+        self._last_obs = None
+        self.policy.reset_behavior()
+        self.learner = self.make_learner()
+
+    def on_other_actions(self) -> None:
+        """Adapt to an environment whose actions have another width than those before."""
+        self.reset_task()
+
+    # Data and environments
+
+    def set_dataset(self, dataset: Data | None) -> None:
+        """Use other trajectories from now on: whatever `open_dataset` takes."""
+        if dataset is not None:
+            opened = open_dataset(dataset)
+            self.check_data(opened)
+            self.dataset = opened
+
+    def check_data(self, dataset: TrajectoryDataset) -> None:
+        """Refuse a dataset that the agent cannot learn from."""
+
+    def check_env(self, env: VecEnv) -> None:
+        """Refuse an environment that the agent cannot act in."""
+        check_spaces(env)
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return as_vec_env(env, monitor=monitor_wrapper)
+
+    def _checked(self, env: GymEnv | str) -> VecEnv:
+        wrapped = self._wrap_env(env, self.verbose)
+        self.check_env(wrapped)
+        return wrapped
+
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
+        """Use another environment, with any number of copies.
+
+        If its actions have another width, what was learned and collected for a task is dropped.
+
+        :raises ValueError: observations that are no images, or actions that are no bounded Box
+        """
+        self._use_env(self._checked(env), force_reset)
+
+    def _use_env(self, env: VecEnv, force_reset: bool = True) -> None:
+        assert isinstance(env.action_space, spaces.Box)
+        other = env.action_space.shape != self.action_space.shape
+        self.env = env
+        self.n_envs = env.num_envs
+        self._vec_normalize_env = unwrap_vec_normalize(env)
+        self.observation_space = env.observation_space
+        self.action_space = env.action_space
+        self.policy.observation_space = env.observation_space
+        self.policy.set_action_space(env.action_space)
+        if other:
+            self.on_other_actions()
+        if force_reset:
+            self._last_obs = None
+        self.rollout = None
+        if self.hyperparameters.seed is not None:
+            env.seed(self.hyperparameters.seed)
+
+    # Model files and copies
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *(f"learner.{name}" for name in model_files.optimizers(self.learner))], []
+
+    def save(
+        self,
+        path: model_files.ModelPath,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write the model file: weights, optimisers, keywords and counters; no episodes, no data.
+
+        :param path: the suffix .zip is added where there is none
+        :param exclude: accepted because SB3 has it; nothing optional is in the file
+        :param include: likewise
+        """
+        about = {
+            "class": self.saved_as or type(self).__name__,
+            "hyperparameters": self.hyperparameters.as_dict(),
+            "action_space": space_as_dict(self.action_space),
+            "dataset": str(self.dataset.path) if self.dataset is not None else None,
+            "counters": self.progress.as_dict(),
+        }
+        model_files.write(path, about, self.policy, self.learner)
+
+    @classmethod
+    def load(
+        cls,
+        path: model_files.ModelPath,
+        env: GymEnv | str | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: Mapping[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """Read a model file.
+
+        :param path: the path given to `save`
+        :param env: the environment to continue with
+        :param custom_objects: accepted because SB3 has it
+        :param print_system_info: print this system's versions, as SB3 does
+        :param kwargs: keywords of the constructor that are to change, also `dataset`
+        :raises ValueError: a file that is cut short, damaged or another agent's; unknown keywords
+        :raises FileNotFoundError: no such file; for a folder, the message lists the files in it
+        """
+        path = model_files.find(path)
+        cls.check_keywords(kwargs)
+        if print_system_info:
+            get_system_info()
+        about, tensors = read_model(path)
+        own = cls.saved_as or cls.__name__
+        kind = about.get("class", own)
+        if kind != own:
+            raise ValueError(
+                f"{path} is of {kind}: read it by {kind}.load, not {cls.__name__}.load"
+            )
+        agent = cls(
+            device=device, _init_setup_model=False, **{**about["hyperparameters"], **kwargs}
+        )
+        agent.action_space = space_from_dict(about["action_space"])
+        agent._setup_model()
+        agent.policy.set_action_space(agent.action_space)
+        agent.restore(about, tensors, cls.shape_keywords)
+        if env is not None:
+            agent.set_env(env, force_reset)
+        return agent
+
+    def restore(
+        self,
+        about: Mapping[str, Any],
+        tensors: Mapping[str, Mapping[str, Tensor]],
+        same: tuple[str, ...],
+    ) -> None:
+        """Take over the weights, optimisers and counters of a model file, as `read_model` reads it.
+
+        :param same: keywords that must be equal here and in the file
+        """
+        model_files.check_same(about, self.hyperparameters.as_dict(), same)
+        progress = self.progress_class.of(about["counters"])
+        model_files.restore(tensors, self.policy, self.learner)
+        self.progress = progress
+
+    def set_parameters(
+        self,
+        load_path_or_dict: Any,
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """Load weights and optimisers in place, from a model file or from `get_parameters`."""
+        if isinstance(load_path_or_dict, dict):
+            super().set_parameters(load_path_or_dict, exact_match, device)
+            return
+        about, tensors = read_model(model_files.find(load_path_or_dict))
+        model_files.check_same(about, self.hyperparameters.as_dict(), self.shape_keywords)
+        model_files.restore(tensors, self.policy, self.learner)
+
+    def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Write the collected episodes to one file."""
+        self.replay_buffer.save(path)
+
+    def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Read what `save_replay_buffer` wrote."""
+        self.replay_buffer = ReplayBuffer.load(path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles hold: all but environment, open episodes and logger."""
+        left_out = {"env", "_vec_normalize_env", "_last_obs", "rollout"}
+        state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
+        return state | {"_custom_logger": False}

@@ -1,4 +1,4 @@
-"""The paper's tasks from pixels, under one Gymnasium namespace. Importing registers them.
+"""The paper's tasks from pixels, in one Gymnasium namespace. Importing this package registers them.
 
 >>> import gymnasium as gym, wpt_envs
 >>> env = gym.make("wpt/dmc-walker-run-v0", pad_action_to="suite")
@@ -24,7 +24,7 @@ for _task in TASKS.values():
 
 
 def __getattr__(name: str) -> Any:
-    if name == "pixels":  # loaded when asked for
+    if name == "pixels":  # loaded at its first use
         from wpt_envs.any_env import pixels
 
         return pixels

@@ -1,4 +1,4 @@
-"""python -m wpt_envs {list, montage, likeness, speed}: the tasks, their looks and their cost."""
+"""python -m wpt_envs {list, montage, likeness, speed}: tasks, renderings and their cost."""
 
 import argparse
 from collections.abc import Callable
@@ -8,19 +8,29 @@ from wpt_envs.tasks import TASKS, Task
 
 
 def main() -> None:
-    """Reads the command line."""
+    """Run one command of the command line."""
     parser = argparse.ArgumentParser(prog="python -m wpt_envs", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="the table of tasks")
-    montage = commands.add_parser("montage", help="exact | near | fast of every task, as a picture")
+    commands.add_parser("list", help="Print the table of tasks.")
+    montage = commands.add_parser(
+        "montage",
+        help="Draw every task in the three renderings, exact, near and fast, into one picture.",
+    )
     montage.add_argument("path", type=Path)
     montage.add_argument("--size", type=int, default=64)
-    likeness = commands.add_parser("likeness", help="PSNR in dB against exact")
+    likeness = commands.add_parser(
+        "likeness", help="Print the PSNR of near and fast against exact, in dB."
+    )
     likeness.add_argument("--states", type=int, default=20)
     for command in (montage, likeness):
         command.add_argument("--suite", choices=sorted({task.suite for task in TASKS.values()}))
-    speed = commands.add_parser("speed", help="CPU ms an agent step, beside the usual renderer")
-    speed.add_argument("--rounds", type=int, default=5, help="of ten steps each")
+    speed = commands.add_parser(
+        "speed",
+        help="Print the CPU time of a step for each rendering and the simulator's own renderer.",
+    )
+    speed.add_argument(
+        "--rounds", type=int, default=5, help="Number of rounds, ten steps each; the median counts."
+    )
     arguments = vars(parser.parse_args())
     run: dict[str, Callable[..., None]] = {
         "list": _list,

@@ -38,7 +38,7 @@ def make(
     rescale_action: bool = False,
     floor: float | None = None,
 ) -> gym.Env:
-    """A task of DMControl from pixels, for example `walker-run`; see `DMControl`."""
+    """Make a task of DMControl from pixels, for example `walker-run`; see `DMControl`."""
     row = tasks.find("dmc", task)
     env = DMControl(row, rendering, camera, seed, render_mode, rescale_action, floor)
     return dress(
@@ -61,8 +61,8 @@ class DMControl(Simulated):
 
     ## Action Space
     `Box(-1, 1, (n,), float32)`: n is 1 for cartpole and acrobot, 6 for cheetah and walker, 12
-    for quadruped; `pad_action_to` widens it, and entries beyond n do nothing. Actions go to the
-    actuators as they are, which clip them to their own range (the quadruped's lift is
+    for quadruped; `pad_action_to` widens it, and entries beyond n have no effect. Actions go to
+    the actuators unchanged, which clip them to their own range (the quadruped's lift is
     [-1, 1.1], its extend [-0.8, 0.8]).
 
     ## Observation Space
@@ -75,8 +75,8 @@ class DMControl(Simulated):
     below a threshold (0.6, cheetah 0.2) and take 0.1 times the norm of the action.
 
     ## Starting State
-    The task's. `reset(seed=s)` gives it `numpy.random.RandomState(s)`, as dm_control's own
-    `random=s` does; `reset()` goes on in the same stream.
+    The task's own. `reset(seed=s)` sets its random state to `numpy.random.RandomState(s)`, as
+    dm_control's `random=s` does; `reset()` continues the same stream.
 
     ## Episode End
     Truncated after 1000 control steps; never terminated.
@@ -84,7 +84,7 @@ class DMControl(Simulated):
     ## Arguments
     Those of `wpt_envs.simulated.Simulated`, with `pad_action_to="suite"` being 12, and
 
-    - `rescale_action=False`: maps [-1, 1] onto the actuators' range.
+    - `rescale_action=False`: map [-1, 1] onto the actuators' range.
     - `floor=None`: half the drawn length of the floor in metres; the stock walker's floor ends
       2 m behind it.
 
@@ -121,7 +121,7 @@ class DMControl(Simulated):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; seed s gives the task `numpy.random.RandomState(s)`."""
+        """Start an episode; a seed s sets the task's `numpy.random.RandomState(s)`."""
         seed = self._seeded(seed)
         if seed is not None:
             self.dm_env.task.random.seed(seed)
@@ -130,12 +130,12 @@ class DMControl(Simulated):
         return _flat(timestep.observation), {}
 
     def step(self, action: np.ndarray) -> StepResult:
-        """One control step."""
+        """Take one control step."""
         if self._range is not None:
             low, high = self._range
             action = low + (action + 1) / 2 * (high - low)
         timestep = self.dm_env.step(action)
-        if timestep.first():  # dm_control begins a new episode by itself
+        if timestep.first():  # dm_control has begun a new episode unasked
             raise ResetNeeded("The episode has ended: call reset() before the next step()")
         terminated = timestep.last() and timestep.discount == 0
         truncated = timestep.last() and not terminated
@@ -143,7 +143,7 @@ class DMControl(Simulated):
 
 
 def _load(task: tasks.Task) -> Environment:
-    """The dm_control environment behind a row: the project's own task, or the stock one."""
+    """Load the dm_control environment of a row: the project's own task, or the stock one."""
     name = task.name.removeprefix(f"{task.embodiment}-").replace("-", "_")
     ours = f"wpt_envs.dmc_tasks.{task.embodiment}"
     if find_spec(ours) is not None and name in import_module(ours).SUITE:

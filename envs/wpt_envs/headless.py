@@ -195,5 +195,5 @@ def _correct_dm_control() -> None:
     try:
         choose()
     except RuntimeError:
-        return  # whoever draws by this package is told
+        return  # the first task or renderer of this package raises it again
     importlib.reload(render)

@@ -1,4 +1,4 @@
-"""Measures the three renderings: how like the exact one, how quick, and side by side."""
+"""Compares the three renderings: their similarity to `exact`, their speed, and how they look."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -21,13 +21,13 @@ THE_FOUR = (  # what the speed is quoted on
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB; infinite for equal pictures."""
+    """Return the peak signal-to-noise ratio in dB, infinite for equal pictures."""
     error = np.mean((image.astype(np.float64) - reference) ** 2)
     return float(10 * np.log10(255**2 / error)) if error else float("inf")
 
 
 def visit_states(env: Simulated, count: int, seed: int = 0) -> Iterator[int]:
-    """Leads the simulator through `count` states of random episodes, ten control steps apart."""
+    """Take the simulator through `count` states of random episodes, ten control steps apart."""
     rng = np.random.default_rng(seed)
     for index in range(count):
         if index % 5 == 0:
@@ -38,12 +38,12 @@ def visit_states(env: Simulated, count: int, seed: int = 0) -> Iterator[int]:
 
 
 def views(env: Simulated) -> dict[str, View]:
-    """The same camera at each of the renderings."""
+    """Return a view by the same camera for each rendering."""
     return {rendering: env.view.at(rendering) for rendering in QUALITIES}
 
 
 def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
-    """Mean PSNR in dB of `near` and `fast` against `exact`."""
+    """Return the mean PSNR in dB of `near` and `fast` against `exact`."""
     env = _bare(task)
     looks = views(env)
     found: dict[str, list[float]] = {"near": [], "fast": []}
@@ -58,10 +58,10 @@ def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
 
 
 def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:
-    """CPU ms an agent step at each rendering, and by the suite's own renderer.
+    """Return the CPU milliseconds of a step by each rendering and by the suite's own renderer.
 
-    They take turns, `steps` steps each, and the median of the rounds counts: a machine that is
-    busy with other things for a while then slows all of them, or none.
+    They take turns of `steps` steps, and the median of the rounds counts, so that other load on
+    the machine slows all of them alike.
     """
     envs = {rendering: gym.make(task.id, rendering=rendering) for rendering in QUALITIES}
     envs["usual"] = gym.make(task.id)
@@ -80,7 +80,7 @@ def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:
 
 
 def _step_cost(env: gym.Env, steps: int) -> float:
-    """CPU milliseconds of the process, all its threads, an agent step."""
+    """Return the CPU milliseconds of a step, summed over the threads of the process."""
     actions = [env.action_space.sample() for _ in range(steps)]
     start = time.process_time()
     for action in actions:
@@ -89,7 +89,7 @@ def _step_cost(env: gym.Env, steps: int) -> float:
 
 
 def usual_renderer(env: Any) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
-    """dm_control's `Physics.render` or gymnasium's `MujocoRenderer`: looks, and frees it."""
+    """Return the suite's own renderer as two functions: one looks, the other frees it."""
     camera = env.view.camera
     if hasattr(env, "dm_env"):
         physics = env.dm_env.physics
@@ -106,14 +106,14 @@ def usual_renderer(env: Any) -> tuple[Callable[[], np.ndarray], Callable[[], Non
 
 
 def _bare(task: Task) -> Simulated:
-    """The environment without pixels around it."""
+    """Make a task without the wrappers that show pixels."""
     env = gym.make(task.id).unwrapped
     assert isinstance(env, Simulated), env
     return env
 
 
 def montage(tasks: list[Task], path: Path, size: int = 64, columns: int = 6) -> None:
-    """Writes a picture: for each task the three renderings of one state, side by side."""
+    """Write a picture with the three renderings of one state of each task, side by side."""
     import imageio.v3
 
     cells = []

@@ -1,4 +1,4 @@
-"""Thins triangle meshes for drawing: one vertex a cell, placed where it keeps the edges sharp."""
+"""Thins triangle meshes for drawing: one vertex per cell of a grid, placed to keep edges sharp."""
 
 from typing import TYPE_CHECKING
 
@@ -7,14 +7,14 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-_FLAT = 0.05  # a direction in which a cell's planes are this much less sure than in the surest
+_FLAT = 0.05  # directions with less than this share of the largest eigenvalue count as flat
 
 
 def thin_meshes(model: "mujoco.MjModel", cell: float, most: int) -> None:
-    """Thins every mesh in place: shorter face lists, and some vertices moved.
+    """Thin every mesh in place: shorten its list of faces, and move some of its vertices.
 
-    :param cell: vertices this near are merged, in metres
-    :param most: a mesh with more faces than this after that gets larger cells
+    :param cell: side of a cell in metres; the vertices in it are merged
+    :param most: the most faces of a mesh; where more are left, its cells grow
     """
     for mesh in range(model.nmesh):
         first, vertices = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
@@ -35,11 +35,11 @@ def thin_meshes(model: "mujoco.MjModel", cell: float, most: int) -> None:
 def _coarsen(
     vertex: np.ndarray, faces: np.ndarray, cell: float, most: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cells just large enough to leave at most `most` faces.
+    """Find cells just large enough to leave at most `most` faces.
 
     :param vertex: (V, 3)
     :param faces: (F, 3)
-    :return: (V,), the cell of each vertex, and (K,), the faces which stay
+    :return: (V,), the cell of each vertex, and (K,), the faces that stay
     """
     while True:
         keys = np.floor(vertex / cell).astype(np.int64)
@@ -51,7 +51,7 @@ def _coarsen(
 
 
 def _proper(corners: np.ndarray) -> np.ndarray:
-    """The faces which still have three corners, each once; both sides of a thin sheet stay.
+    """Find the faces that still have three corners, each once; both sides of a thin sheet stay.
 
     :param corners: (F, 3), the cells of each face's corners
     :return: (K,), their indices
@@ -64,10 +64,10 @@ def _proper(corners: np.ndarray) -> np.ndarray:
 
 
 def _places(vertex: np.ndarray, faces: np.ndarray, group: np.ndarray, cell: float) -> np.ndarray:
-    """For each cell the point nearest to the planes of its faces.
+    """Find for each cell the point nearest to the planes of its faces.
 
-    The point minimises the sum of squared distances to the planes (a quadric error), starting
-    from the vertices' mean and moving only where the planes leave no doubt.
+    It minimises the sum of squared distances to the planes (a quadric error). It starts from the
+    vertices' mean and moves only in directions that the planes determine.
 
     :param vertex: (V, 3)
     :param faces: (F, 3)
@@ -94,6 +94,6 @@ def _places(vertex: np.ndarray, faces: np.ndarray, group: np.ndarray, cell: floa
 
 
 def _sum_by(owner: np.ndarray, values: np.ndarray, owners: int) -> np.ndarray:
-    """(N, D) values added up by owner: (owners, D)."""
+    """Add up values (N, D) by owner: (owners, D)."""
     columns = [np.bincount(owner, column, owners) for column in values.T]
     return np.stack(columns, axis=1)

@@ -30,7 +30,7 @@ def make(
     render_mode: str | None = "rgb_array",
     render_size: int | None = None,
 ) -> gym.Env:
-    """A task of Meta-World from pixels, for example `button-press`; see `MetaWorld`."""
+    """Make a task of Meta-World from pixels, for example `button-press`; see `MetaWorld`."""
     env = MetaWorld(tasks.find("metaworld", task), rendering, camera, seed, render_mode)
     return dress(
         env,
@@ -65,7 +65,7 @@ class MetaWorld(Achieved):
     so far, and `info["is_success"]` repeats `success` for Stable-Baselines3.
 
     ## Starting State
-    Drawn at each reset. `reset(seed=s)` starts the stream anew, bit for bit; `reset()` goes on.
+    Drawn at each reset. `reset(seed=s)` restarts the stream exactly; `reset()` continues it.
 
     ## Episode End
     Truncated after 200 control steps; never terminated, success or not.
@@ -94,17 +94,17 @@ class MetaWorld(Achieved):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws a new goal and object; a seed starts their stream anew."""
+        """Draw a new goal and object; a seed restarts their stream."""
         seed = self._seeded(seed)
         if seed is not None:
             self.sawyer.seed(seed)  # its reset ignores one
-        mujoco.mj_resetData(self.sawyer.model, self.sawyer.data)  # forget the last episode wholly
+        mujoco.mj_resetData(self.sawyer.model, self.sawyer.data)  # forget the last episode
         state, _ = self.sawyer.reset()
         mujoco.mj_forward(self.sawyer.model, self.sawyer.data)  # else the goal is drawn elsewhere
         return self._bounded(state), self._began()
 
     def step(self, action: np.ndarray) -> StepResult:
-        """One control step; success never ends an episode."""
+        """Take one control step; success never ends an episode."""
         state, reward, _, _, info = self.sawyer.step(action)
         return self._bounded(state), float(reward), False, *self._stepped(info["success"])
 
@@ -113,9 +113,9 @@ class MetaWorld(Achieved):
 
 
 def _goal_observable(sawyer: SawyerXYZEnv) -> SawyerXYZEnv:
-    """Random goals from the environment's own seed, held by the state.
+    """Draw goals by the environment's own seed, and show them in the state.
 
-    Private attributes of metaworld 3.1.1, touched here and nowhere else.
+    These are private attributes of metaworld 3.1.1, which no other code uses.
     """
     sawyer._partially_observable = False
     del sawyer.sawyer_observation_space  # cached while the goal was hidden; step() clips to it

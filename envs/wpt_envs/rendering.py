@@ -1,4 +1,4 @@
-"""The one renderer: a model's picture at three prices, from a GL context of its own."""
+"""The renderer: pictures of a MuJoCo model at three levels of quality, from its own GL context."""
 
 import os
 import weakref
@@ -29,15 +29,15 @@ Camera = str | int | dict[str, Any]  # a name, a number, or the free camera's at
 
 @dataclass(frozen=True)
 class Quality:
-    """What a rendering spends. `None` keeps what the model asks for."""
+    """How much a rendering computes; None keeps the model's own setting."""
 
     samples: int | None = None  # multisampling
-    supersample: int = 1  # draws so many times larger, then averages
+    supersample: int = 1  # draws larger by this factor, then averages
     shadow_size: int | None = None  # texels of the shadow map
     tessellation: tuple[int, int, int] | None = None  # slices, stacks, quads of round shapes
     floor_spacing: float = 1  # widens the grid on which a floor is lit
-    cell: float = 0  # vertices of a mesh this near are merged, in metres
-    faces: int | None = None  # the most triangles that a mesh is drawn with
+    cell: float = 0  # side in metres of the cells in which vertices of a mesh are merged
+    faces: int | None = None  # largest number of triangles of a mesh
     off: tuple[str, ...] = ()
 
 
@@ -65,14 +65,14 @@ QUALITIES = {
 
 
 class Renderer:
-    """Draws `data` as seen by one camera. Physics is never touched.
+    """Draws `data` as one camera sees it, without any effect on the physics.
 
-    The GL context is made at the first picture, so that an environment which never draws
-    costs none, and is current only while it draws, so that nobody else's frames change.
+    The GL context is made at the first picture, so that environments that never draw need none. It
+    is current only while this draws, so that other renderers are not disturbed.
 
-    :param camera: name or number of a camera of the model; -1 is the free camera, and a dict
-        the free camera with these attributes, such as `distance`
-    :param flip: turns the picture upside down
+    :param camera: name or number of a camera of the model, -1 for the free camera, or a dict of
+        attributes of the free camera, such as `distance`
+    :param flip: turn the picture upside down
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Renderer:
         self._finalizer: weakref.finalize | None = None
 
     def render(self) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8, the top row first."""
+        """Return the picture now: (size, size, 3) uint8, the top row first."""
         if self._gl is None or self._process != os.getpid():  # a context does not survive a fork
             self._open()
         mujoco.mjv_updateScene(
@@ -111,14 +111,14 @@ class Renderer:
         return _shrink(image, self._quality.supersample)
 
     def upload_terrain(self) -> None:
-        """Shows the model's height fields as they are now."""
+        """Upload the model's height fields as they are now."""
         if self._gl is not None:
             with current(self._gl):
                 for field_id in range(self._model.nhfield):
                     mujoco.mjr_uploadHField(self._model, self._mjr, field_id)
 
     def close(self) -> None:
-        """Frees the GL context; the next picture makes a new one."""
+        """Free the GL context; the next picture makes a new one."""
         if self._finalizer is not None:
             self._finalizer()
             self._gl = self._mjr = self._finalizer = None
@@ -140,9 +140,9 @@ class Renderer:
 
 
 class View:
-    """One camera of a model at any size: a renderer for each size asked for.
+    """One camera of a model, with a renderer for each size of its pictures.
 
-    :param upright: turns the picture over if the camera hangs upside down
+    :param upright: turn the picture over if the camera hangs upside down
     """
 
     def __init__(
@@ -161,25 +161,25 @@ class View:
         self._renderers: dict[int, Renderer] = {}
 
     def at(self, rendering: str) -> "View":
-        """A view by the same camera at another rendering."""
+        """Return a view by the same camera at another rendering."""
         other = copy(self)
         other._new = partial(self._new, rendering=rendering)
         other._renderers = {}
         return other
 
     def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
+        """Return the picture now: (size, size, 3) uint8."""
         if size not in self._renderers:
             self._renderers[size] = self._new(size=size)
         return self._renderers[size].render()
 
     def upload_terrain(self) -> None:
-        """Shows the model's height fields as they are now."""
+        """Upload the model's height fields as they are now."""
         for renderer in self._renderers.values():
             renderer.upload_terrain()
 
     def close(self) -> None:
-        """Frees the GL contexts."""
+        """Free the GL contexts."""
         for renderer in self._renderers.values():
             renderer.close()
 
@@ -191,7 +191,7 @@ def _quality(rendering: str) -> Quality:
 
 
 def _hangs(model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> bool:
-    """Whether a camera's upward axis points down."""
+    """Return whether a camera's upward axis points down."""
     mujoco.mj_camlight(model, data)
     return data.cam_xmat[camera].reshape(3, 3)[2, 1] < 0
 
@@ -212,7 +212,7 @@ def _camera(model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """Averages squares of `factor` x `factor` pixels; always a fresh array."""
+    """Average squares of `factor` x `factor` pixels into a new array."""
     if factor == 1:
         return image.copy()
     total = image[::factor, ::factor].astype(np.uint16)
@@ -226,7 +226,7 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 @contextmanager
 def _lowered(model: mujoco.MjModel, quality: Quality, side: int) -> Iterator[None]:
-    """Lowers what a GL context reads of the model while it is made, then puts all of it back."""
+    """Lower what a GL context reads of the model while it is made, then restore all of it."""
     detail, window = model.vis.quality, model.vis.global_
     slices, stacks, quads = quality.tessellation or (None, None, None)
     numbers = [

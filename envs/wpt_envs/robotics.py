@@ -15,7 +15,7 @@ from wpt_envs.simulation import fixed_usual_camera
 from wpt_envs.wrappers import dress
 
 # isort: split
-with redirect_stderr(StringIO()):  # a notice about its versions, of which ours is fixed
+with redirect_stderr(StringIO()):  # it prints a notice on versions, and ours is fixed
     import gymnasium_robotics
 
 _IDS = {
@@ -47,7 +47,7 @@ def make(
     render_mode: str | None = "rgb_array",
     render_size: int | None = None,
 ) -> gym.Env:
-    """A task of Gymnasium-Robotics from pixels, for example `fetch-push`; see `Robotics`."""
+    """Make a task of Gymnasium-Robotics from pixels, for example `fetch-push`; see `Robotics`."""
     env = Robotics(tasks.find("robotics", task), rendering, camera, seed, render_mode)
     return dress(
         env,
@@ -82,7 +82,7 @@ class Robotics(Achieved):
     and `info["is_success"]` are as in Meta-World.
 
     ## Starting State
-    The environment's; `reset(seed=s)` starts its stream anew.
+    The environment's own; `reset(seed=s)` restarts its stream.
 
     ## Episode End
     Truncated after 50 (Fetch, hand reach), 100 (Shadow hand) or 200 (Adroit) control steps;
@@ -117,18 +117,18 @@ class Robotics(Achieved):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode, from the robot's own stream of goals."""
+        """Start an episode, with a goal from the robot's own stream."""
         observation, _ = self.robot.reset(seed=self._seeded(seed))
         return self._state(observation), self._began()
 
     def step(self, action: np.ndarray) -> StepResult:
-        """One control step; success never ends an episode."""
+        """Take one control step; success never ends an episode."""
         observation, reward, _, _, info = self.robot.step(action)
         success = info.get("is_success", info.get("success", False))
         return self._state(observation), float(reward), False, *self._stepped(success)
 
     def _state(self, observation: Any) -> np.ndarray:
-        """Flattens it, and puts the goal's marker in its place whether or not anyone looks."""
+        """Flatten the observation, and move the goal's marker, which otherwise moves at drawing."""
         show_goal = getattr(self.robot, "_render_callback", None)
         if show_goal is not None:
             show_goal()

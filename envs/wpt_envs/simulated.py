@@ -1,4 +1,4 @@
-"""What the suites share: a MuJoCo task at its control rate, seen by one camera."""
+"""The base of the suites: a MuJoCo task at its control rate, seen by one camera."""
 
 from typing import Any
 
@@ -12,21 +12,26 @@ StepResult = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 
 
 class Simulated(gym.Env):
-    """Observes the state; is looked at through `look`. Subclasses reset, step and set `view`.
+    """A task that observes the state and shows its picture by `look`.
+
+    Subclasses define `reset` and `step`, and set `view`.
 
     ## Arguments
-    Of every family, given to `gymnasium.make`:
+    `gymnasium.make` takes these for every family:
 
-    - `image_size=64`: the side of the observed picture.
-    - `action_repeat`: control steps a step, their rewards summed; 2, and 1 for robotics.
-    - `pad_action_to=None`: widens the actions to a number, or to the `"suite"`'s widest.
-    - `rendering="near"`: or `"exact"` (the simulator's own settings), `"fast"` (no shadows).
-    - `camera`: a camera's name or number, -1 the free one, or the free one's attributes as a
-      dict, such as `{"distance": 3.0}`; by default the family's.
-    - `state_in_info=False`: puts the simulator's own observation, flat, into `info["state"]`.
-    - `seed=None`: of the first reset, if that is given none.
-    - `render_mode="rgb_array"` or `None`, `render_size=None`: what `render()` answers, and its
-      side; `None` is the observation's.
+    - `image_size=64`: side of the observed picture.
+    - `action_repeat`: number of control steps in a step, whose rewards are summed; 2, and 1 for
+      robotics.
+    - `pad_action_to=None`: width to which actions are padded; `"suite"` is the suite's widest.
+    - `rendering="near"`: quality of the picture; `"exact"` has the simulator's own settings,
+      `"fast"` no shadows.
+    - `camera`: name or number of a camera, -1 for the free camera, or attributes of the free
+      camera as a dict, such as `{"distance": 3.0}`; the family has its default.
+    - `state_in_info=False`: puts the simulator's own observation, flattened, into
+      `info["state"]`.
+    - `seed=None`: seed of the first reset, unless that has its own.
+    - `render_mode="rgb_array"`: with `None`, `render()` returns nothing.
+    - `render_size=None`: side of what `render()` returns; `None` for the observation's.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
@@ -40,19 +45,19 @@ class Simulated(gym.Env):
         self._first_seed = seed
 
     def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
+        """Return the picture now: (size, size, 3) uint8."""
         return self.view.look(size)
 
     def render(self) -> np.ndarray | None:
-        """The picture at 240 x 240."""
+        """Return the picture at 240 x 240."""
         return None if self.render_mode is None else self.look(240)
 
     def close(self) -> None:
-        """Frees the GL contexts."""
+        """Free the GL contexts."""
         self.view.close()
 
     def _seeded(self, seed: int | None) -> int | None:
-        """The seed of this reset: the one given, else at the first reset the constructor's."""
+        """Return the seed of this reset: its own, or at the first reset the constructor's."""
         seed = self._first_seed if seed is None else seed
         self._first_seed = None
         gym.Env.reset(self, seed=seed)
@@ -60,19 +65,19 @@ class Simulated(gym.Env):
 
 
 class Achieved(Simulated):
-    """Counts success: now, and at any step of the episode. Never ends by it."""
+    """A task that reports success at this step and at any step so far, and goes on after it."""
 
     def _began(self) -> dict[str, Any]:
-        """The info of a reset."""
+        """Return the info of a reset."""
         self._frame, self._ever = 0, False
         return self._achieved(False)
 
     def _stepped(self, success: float) -> tuple[bool, dict[str, Any]]:
-        """Whether the episode is over by its length, and the info of a step."""
+        """Return whether the episode has reached its length, and the info of a step."""
         self._frame += 1
         return self._frame >= self.task.frames, self._achieved(bool(success))
 
     def _achieved(self, success: bool) -> dict[str, Any]:
-        """`is_success` is `success` under the name which Stable-Baselines3 looks for."""
+        """Return the info; `is_success` is the name that Stable-Baselines3 looks for."""
         self._ever = self._ever or success
         return {"success": success, "success_any": self._ever, "is_success": success}

@@ -1,4 +1,4 @@
-"""The table: one row a task. Names, embodiments, widths and lengths stand here and nowhere else."""
+"""The table of tasks: the only place for their names, embodiments, widths and lengths."""
 
 import difflib
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ _ROBOTICS = {
 
 @dataclass(frozen=True)
 class Task:
-    """One row: a task of a suite."""
+    """A task of a suite, which is one row of the table."""
 
     suite: str
     name: str
@@ -90,7 +90,7 @@ ANT_SEQUENCE: tuple[str, ...] = tuple(
 
 
 def suite(name: str, paper_only: bool = True) -> list[Task]:
-    """The tasks of one suite, in the table's order."""
+    """Return the tasks of one suite, in the table's order."""
     rows = [task for task in TASKS.values() if task.suite == name]
     if not rows:
         suites = sorted({task.suite for task in TASKS.values()})
@@ -99,21 +99,21 @@ def suite(name: str, paper_only: bool = True) -> list[Task]:
 
 
 def suite_width(name: str) -> int:
-    """The width of a suite's widest actions: what `pad_action_to="suite"` is."""
+    """Return the width of a suite's widest actions, which `pad_action_to="suite"` stands for."""
     return max(task.action_dim for task in suite(name, paper_only=False))
 
 
 def pad_width(suite_name: str, pad_action_to: int | str | None) -> int | None:
-    """The number behind `pad_action_to`."""
+    """Return the width that `pad_action_to` stands for."""
     if pad_action_to == "suite":
         return suite_width(suite_name)
     if pad_action_to is None or isinstance(pad_action_to, int):
         return pad_action_to
-    raise ValueError(f"pad_action_to={pad_action_to!r}; give a number, 'suite' or None")
+    raise ValueError(f"pad_action_to={pad_action_to!r}: pass a number, 'suite' or None")
 
 
 def find(suite_name: str, name: str) -> Task:
-    """The row of a task; an unknown name is answered with the nearest ones."""
+    """Return the row of a task; the error for an unknown name lists the nearest ones."""
     task = TASKS.get(f"wpt/{suite_name}-{name}-v0")
     if task is None:
         names = [row.name for row in suite(suite_name, paper_only=False)]

@@ -1,4 +1,4 @@
-"""Small wrappers, each named by its verb: CheckAction, RepeatAction, PadAction, SeePixels."""
+"""Small wrappers, each named by a verb: CheckAction, RepeatAction, PadAction, SeePixels."""
 
 from typing import Any
 
@@ -9,23 +9,25 @@ from gymnasium.utils import RecordConstructorArgs
 
 
 class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
-    """Refuses an action of the wrong shape, outside the box or not finite, before it acts."""
+    """Refuses an action of the wrong shape, outside the Box or not finite, before it is taken."""
 
     def __init__(self, env: gym.Env) -> None:
         RecordConstructorArgs.__init__(self)
         gym.ActionWrapper.__init__(self, env)
 
     def action(self, action: np.ndarray) -> np.ndarray:
-        """The same action as float32, or a ValueError.
+        """Return the same action as float32.
 
         :param action: (A,)
+        :raises ValueError: an action that the environment does not take
         """
-        action, box = np.asarray(action, np.float32), self.action_space
+        action = np.asarray(action, np.float32)
+        box = self.action_space
         assert isinstance(box, spaces.Box), box
         if action.shape != box.shape:
-            raise ValueError(f"The action has shape {action.shape}; {box.shape} is wanted")
+            raise ValueError(f"The action has the shape {action.shape}, but it must be {box.shape}")
         if not np.isfinite(action).all():
-            raise ValueError(f"The action holds NaN or infinity: {action}")
+            raise ValueError(f"The action contains NaN or infinity: {action}")
         if np.any(action < box.low - 1e-6) or np.any(action > box.high + 1e-6):
             raise ValueError(
                 f"The action {action} lies outside [{box.low.min()}, {box.high.max()}]; "
@@ -35,7 +37,7 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
 
 
 class PadAction(gym.ActionWrapper, RecordConstructorArgs):
-    """Widens the actions to `size`; the environment gets the leading ones."""
+    """Widens the actions to `size`, and passes the leading entries to the environment."""
 
     def __init__(self, env: gym.Env, size: int) -> None:
         RecordConstructorArgs.__init__(self, size=size)
@@ -46,8 +48,8 @@ class PadAction(gym.ActionWrapper, RecordConstructorArgs):
         (width,) = box.shape
         if size < width:
             raise ValueError(
-                f"pad_action_to={size} is narrower than the task's {width} actions; "
-                f"give {width} or more, or None"
+                f"pad_action_to={size} is narrower than the task's {width} actions: "
+                f"pass {width} or more, or None"
             )
         self._width = width
         pad = np.ones(size - width, np.float32)
@@ -55,25 +57,25 @@ class PadAction(gym.ActionWrapper, RecordConstructorArgs):
         self.action_space = spaces.Box(low, high, dtype=np.float32)
 
     def action(self, action: np.ndarray) -> np.ndarray:
-        """The entries which the environment has."""
+        """Return the entries that the environment has."""
         return action[: self._width]
 
 
 class RepeatAction(gym.Wrapper, RecordConstructorArgs):
-    """Applies each action `times` times and sums the rewards; stops where the episode ends."""
+    """Applies each action `times` times, sums the rewards, and stops where the episode ends."""
 
     def __init__(self, env: gym.Env, times: int) -> None:
         RecordConstructorArgs.__init__(self, times=times)
         gym.Wrapper.__init__(self, env)
         if times < 1 or times != int(times):
-            raise ValueError(f"action_repeat={times}; give a whole number, 1 or more")
+            raise ValueError(f"action_repeat={times}: pass a whole number, 1 or more")
         self._times = times
         self.metadata = dict(env.metadata)
         if "render_fps" in env.metadata:
             self.metadata["render_fps"] = env.metadata["render_fps"] / times
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step of the agent: the last observation and info, the sum of the rewards."""
+        """Take one step of the agent; return the last observation, the rewards' sum and info."""
         total = 0.0
         for _ in range(self._times):
             obs, reward, terminated, truncated, info = self.env.step(action)
@@ -84,12 +86,12 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
 
 
 class SeePixels(gym.Wrapper, RecordConstructorArgs):
-    """Replaces the observation by the picture, taken once after the step.
+    """Replaces the observation by the picture, which is taken once after each step.
 
-    The environment underneath has `look(size)`, its picture as (size, size, 3) uint8.
+    The environment underneath must have `look(size)`, which returns (size, size, 3) uint8.
 
-    :param state_in_info: puts the observation underneath into `info["state"]`
-    :param render_size: side of what `render()` answers; `None` is the last observation
+    :param state_in_info: put the observation underneath into `info["state"]`
+    :param render_size: side of what `render()` returns; the last observation if None
     """
 
     def __init__(
@@ -104,25 +106,25 @@ class SeePixels(gym.Wrapper, RecordConstructorArgs):
         )
         gym.Wrapper.__init__(self, env)
         if min(image_size, render_size or image_size) < 1:
-            raise ValueError(f"{image_size=}, {render_size=}; give 1 or more")
+            raise ValueError(f"{image_size=}, {render_size=} are not allowed: pass 1 or more")
         self._image_size, self._render_size = image_size, render_size or image_size
         self._state_in_info = state_in_info
         self._image: np.ndarray | None = None
         self.observation_space = spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """The first picture of an episode."""
+        """Begin an episode and return its first picture."""
         state, info = self.env.reset(**kwargs)
         return self._seen(state, info)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """The picture after the step."""
+        """Take a step and return the picture after it."""
         state, reward, terminated, truncated, info = self.env.step(action)
         image, info = self._seen(state, info)
         return image, float(reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The last picture, at `render_size`."""
+        """Return the last picture, at `render_size`."""
         if self.render_mode is None:
             return None
         if self._render_size == self._image_size and self._image is not None:
@@ -145,7 +147,7 @@ def dress(
     state_in_info: bool,
     render_size: int | None,
 ) -> gym.Env:
-    """An environment with `look` in its pixel clothes: repeat, see, pad, check."""
+    """Wrap an environment that has `look`: repeat actions, see pixels, pad and check actions."""
     env = RepeatAction(env, action_repeat)
     env = SeePixels(env, image_size, state_in_info, render_size)
     if pad_action_to is not None:

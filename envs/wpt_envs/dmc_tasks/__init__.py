@@ -1,1 +1,1 @@
-"""The tasks which dm_control does not have, in its own layout."""
+"""The tasks that dm_control does not have, in dm_control's layout."""

@@ -139,7 +139,8 @@ def declare(
     own = agent.__dict__.get("__doc__")
     if own:
         indented = textwrap.indent(keywords.documentation(), "    ")
-        agent.__doc__ = f"{own.rstrip()}\n{indented}\n    "
+        gap = "\n" if ":param" in own else "\n\n"  # a list of parameters stands apart
+        agent.__doc__ = f"{own.rstrip()}{gap}{indented}\n    "
 
 
 def signature(keywords: type[Keywords], init: Callable[..., None]) -> inspect.Signature:

@@ -1,0 +1,89 @@
+"""Let the import paths of version 0.1 work for one more version, with a DeprecationWarning.
+
+`import wpt_agents.policy` finds a module that looks up its names in `wpt_agents.model.policy`.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+PACKAGE = "wpt_agents"
+FOLDERS = {  # of version 0.2, and the modules of version 0.1 that are in them under their old names
+    "data": (
+        *("codecs", "convert", "dataset", "images", "importers", "index", "replay", "retrieval"),
+        *("shards", "trajectory", "windows"),
+    ),
+    "fast": ("acting", "compiled", "scan"),
+    "files": ("archive", "model_file", "names"),
+    "model": (
+        *("actor_critic", "behavior_cloning", "distributions", "networks", "policy", "rssm"),
+        "world_model",
+    ),
+    "training": ("checks", "distributed", "guidance", "pretraining", "rollout"),
+}
+MOVED = {
+    f"{PACKAGE}.{name}": f"{PACKAGE}.{folder}.{name}"
+    for folder, names in FOLDERS.items()
+    for name in names
+}
+MOVED |= {
+    "wpt_agents.exploration": "wpt_agents.agents.curious",
+    "wpt_agents.importers.convert": "wpt_agents.data.convert",
+    "wpt_agents.saving": "wpt_agents.agents.saved",
+    "wpt_agents.updates": "wpt_agents.training.learner",
+    "wpt_agents.wpt": "wpt_agents.agents.wpt",
+}
+MOVED |= {
+    f"wpt_agents.importers.{name}": f"wpt_agents.data.importers.{name}"
+    for name in ("episodes", "hdf5", "lerobot", "minari", "npz", "rlds", "sb3")
+}
+
+
+class MovedModule(ModuleType):
+    """Stands at an old path; its names are those of the module at the new path."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a name of the module at the new path."""
+        if name.startswith("__"):  # the import system asks for some
+            raise AttributeError(name)
+        return getattr(import_module(MOVED[self.__name__]), name)
+
+    def __dir__(self) -> list[str]:
+        """Return the names of the module at the new path."""
+        return dir(import_module(MOVED[self.__name__]))
+
+
+class MovedFinder(MetaPathFinder, Loader):
+    """Finds the modules of version 0.1."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return a spec for an old path, None for any other."""
+        if fullname not in MOVED:
+            return None
+        return ModuleSpec(fullname, self, is_package=fullname == "wpt_agents.importers")
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Make a module that looks its names up at the new path."""
+        return MovedModule(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Warn that the path is old."""
+        new = MOVED[module.__name__]
+        warnings.warn(
+            f"{module.__name__} has moved to {new}. The old path works in this version only",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+
+
+def install() -> None:
+    """Let the import system find old paths, after all others."""
+    if not any(isinstance(finder, MovedFinder) for finder in sys.meta_path):
+        sys.meta_path.append(MovedFinder())

@@ -105,6 +105,23 @@ def test_mix_takes_the_share_asked_for(ratio, others):
     assert (~batch.reward_known[:, 1:].all(1)).sum() == others
 
 
+def test_a_share_of_the_online_rows_comes_from_the_five_newest_episodes():
+    online, retrieved = filled(*(chain(20, seed) for seed in range(12))), filled(chain(20, 12))
+    rows = online.draw_recent(40, 8, rng())
+    assert {i for row in rows for i, _, _ in row} == {7, 8, 9, 10, 11}
+    one, all_recent = (mix(online, retrieved, 0.25, 16, 8, 2, rng(), s) for s in (0.25, 1.0))
+    for batch in (one, all_recent):
+        check_chain(batch)
+        assert batch.reward_known[:12, 1:].all() and not batch.reward_known[12:].any()
+    plain, none = (mix(online, retrieved, 0.25, 16, 8, 2, rng(), *more) for more in ((), (0.0,)))
+    assert all((array == tensors(none)[name]).all() for name, array in tensors(plain).items())
+
+
+def test_fewer_episodes_than_five_are_all_the_newest():
+    rows = filled(chain(20), chain(20, 1)).draw_recent(40, 8, rng())
+    assert {i for row in rows for i, _, _ in row} == {0, 1}
+
+
 @pytest.mark.parametrize("retrieved", [None, ReplayBuffer()])
 def test_mix_without_retrieved_data_is_all_online(retrieved):
     batch = mix(filled(chain(9)), retrieved, 0.5, 8, 4, 2, rng())

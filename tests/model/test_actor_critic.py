@@ -7,6 +7,7 @@ import torch
 from chain import chain
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.replay import mix
 from wpt_agents.fast import pieces
 from wpt_agents.model.actor_critic import (
     Actor,
@@ -19,6 +20,7 @@ from wpt_agents.model.actor_critic import (
     lambda_return,
     return_range,
 )
+from wpt_agents.model.distributions import two_hot_loss
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import IMAGE_SPACE, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
@@ -336,6 +338,66 @@ def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
         model.update(metrics)
         assert metrics["train/return_scale"][-1].item() == pytest.approx(scale)
     assert model.policy.return_scale.item() == pytest.approx(3.87 * 0.99**200)
+
+
+# ----------------------------------------------------------------- what DreamerV3 does otherwise
+
+
+def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula():
+    model = filled(actor_grad="reinforce", ent_coef=0.1, gamma=0.9)
+    learner, policy = model.learner, model.policy
+    start = policy.world_model.rssm.initial(6)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        imagined = learner.imagine(start, torch.arange(6), generator)
+    loss = learner.actor_loss(imagined, torch.tensor(2.0))
+    dream, reward, value, returns = imagined
+    expected = 0.0
+    for n in range(6):
+        for t in range(dream.action.shape[1] - 1):
+            feat = torch.cat([dream.states.deter[n, t], dream.states.stoch[n, t].flatten()])
+            dist = policy.actor.dist(feat, policy.action_mask)
+            better = reward[n, t] + 0.9 * returns[n, t + 1] - value[n, t]
+            gain = dist.log_prob(dream.action[n, t]) * better / 2 + 0.1 * dist.entropy()
+            expected -= 0.9**t * gain / (6 * (dream.action.shape[1] - 1))
+    torch.testing.assert_close(loss, expected)
+    loss.backward()
+    assert all(p.grad is None for p in policy.world_model.parameters())
+    assert any(p.grad.abs().sum() > 0 for p in policy.actor.parameters())
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3])
+def test_the_replay_value_loss_teaches_the_critic_alone(scale):
+    updated = []
+    for repval_scale in (0.0, scale):
+        model, metrics = filled(repval_scale=repval_scale), defaultdict(list)
+        model.update(metrics)
+        updated.append((metrics, model.policy))
+    (_, without), (metrics, policy) = updated
+    assert ("train/replay_value_loss" in metrics) is (scale > 0)
+    same = all(map(torch.equal, without.critic.parameters(), policy.critic.parameters()))
+    assert same is (scale == 0)
+    for part in ("world_model", "actor"):
+        weights = (getattr(each, part).parameters() for each in (without, policy))
+        assert all(map(torch.equal, *weights))
+
+
+def test_the_replay_value_loss_is_that_of_the_replayed_rewards():
+    model = filled(repval_scale=0.3, gamma=0.5, lam=1.0)
+    batch = mix(model.replay_buffer, None, 0, 2, 4, model.max_action_dim, np.random.default_rng(0))
+    post, _ = model.learner.update_world_model(batch, torch.Generator().manual_seed(0))
+    loss = model.learner.replay_value_loss(post, batch)
+    policy = model.policy
+    with torch.no_grad():
+        value = policy.target_critic.value(post.feat)
+    # with λ = 1 the return is the discounted sum of rewards and the value of the last state
+    returns = value.clone()
+    for t in (2, 1, 0):
+        later = batch.reward[:, t] + 0.5 * returns[:, t + 1]
+        returns[:, t] = torch.where(batch.is_first[:, t + 1], value[:, t], later)
+    each = two_hot_loss(policy.critic(post.feat), returns)
+    expected = (each * batch.reward_known).sum() / batch.reward_known.sum()
+    torch.testing.assert_close(loss, expected)
 
 
 # ------------------------------------------------------------------------------- head start

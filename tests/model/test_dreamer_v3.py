@@ -67,8 +67,8 @@ def test_replayed_returns_by_hand():
     cut = bools([False, True, False])
     expected = torch.tensor([[3.5, 5.0, 4.0]])
     torch.testing.assert_close(replay_return(reward, bootstrap, cut, no, 0.5, 0.5), expected)
-    # one that terminates there its reward: V_1 = 2, V_0 = 1 + .5 (.5 * 5 + .5 * 2)
-    expected = torch.tensor([[2.75, 2.0, 4.0]])
+    # one that terminates there its reward: V_1 = v_1 = 2, V_0 = 1 + .5 (.5 * 2 + .5 * 2)
+    expected = torch.tensor([[2.0, 2.0, 4.0]])
     torch.testing.assert_close(replay_return(reward, bootstrap, cut, cut, 0.5, 0.5), expected)
     end = bools([False, False, True])
     assert replay_return(reward, bootstrap, end, end)[0, 2] == 3

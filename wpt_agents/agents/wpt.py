@@ -342,6 +342,7 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
             settings.batch_length,
             settings.max_action_dim,
             self.streams.numpy(Purpose.UPDATE, progress.updates),
+            settings.recent_share,
         ).to(self.device)
         head_start = progress.task_updates < settings.actor_delay
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0

@@ -15,6 +15,7 @@ from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.data.windows import Piece, Row, Windows, make_batch
 from wpt_agents.files.archive import load_arrays, save_arrays
 
+NEWEST = 5  # episodes that `draw_recent` draws from
 ARRAYS = ("image", "action", "reward")
 LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 
@@ -67,6 +68,13 @@ class ReplayBuffer:
             self._windows = Windows(np.array([len(t) for t in self.trajectories]))
         return self._windows.draw(batch_size, length, rng)
 
+    def draw_recent(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
+        """Draw pieces as `draw` does, from the five newest episodes alone."""
+        lengths = np.array([len(t) for t in self.trajectories[-NEWEST:]])
+        before = len(self.trajectories) - len(lengths)
+        rows = Windows(lengths).draw(batch_size, length, rng)
+        return [[(before + i, start, stop) for i, start, stop in row] for row in rows]
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file (arrays and JSON, no pickle), whole or not at all."""
         episodes = [{k: getattr(t, k) for k in LABELS} for t in self.trajectories]
@@ -100,17 +108,23 @@ def mix(
     length: int,
     action_width: int,
     rng: np.random.Generator,
+    recent_share: float = 0.0,
 ) -> Batch:
     """Experience rehearsal: a batch of `online`, then `batch_size * ratio` rows of `retrieved`.
 
     The rewards of `retrieved` are of other tasks or of none, so they are hidden.
+
+    :param recent_share: share of the online rows that come from the newest episodes, which uniform
+        replay shows least often
     """
     if not 0 <= ratio <= 1:
         raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")
     others = round(batch_size * ratio) if retrieved else 0
     trajectories, rows = online.trajectories, []
+    recent = round((batch_size - others) * recent_share)
     if others < batch_size:
-        rows = online.draw(batch_size - others, length, rng)
+        rows = online.draw(batch_size - others - recent, length, rng) if recent_share < 1 else []
+        rows += online.draw_recent(recent, length, rng) if recent else []
     if retrieved and others:
         behind = len(trajectories)
         trajectories = trajectories + retrieved.trajectories

@@ -54,26 +54,27 @@ def reinforce_loss(
 
 def replay_return(
     reward: Tensor,
-    bootstrap: Tensor,
+    value: Tensor,
     is_last: Tensor,
     is_terminal: Tensor,
     gamma: float = 0.99,
     lam: float = 0.95,
 ) -> Tensor:
-    """λ-returns of replayed steps: V_t = r_t + γ [(1 - λ) b_{t+1} + λ V_{t+1}].
+    """λ-returns of replayed steps: V_t = r_t + γ [(1 - λ) v_{t+1} + λ V_{t+1}].
 
     :param reward: (B, T), on arriving in each replayed state
-    :param bootstrap: (B, T), b_t, the imagined return of a dream from each state
+    :param value: (B, T), the critic's mean in each replayed state
     :param is_last: (B, T) bool, the next state belongs to another episode
     :param is_terminal: (B, T) bool, the episode ended here and nothing follows
-    :return: (B, T); the last step of a sequence or an episode is its bootstrap
+    :return: (B, T); at the last step of a sequence or an episode it is the critic's value
     """
-    assert reward.shape == bootstrap.shape == is_last.shape == is_terminal.shape, reward.shape
-    returns = [torch.where(is_terminal[:, -1], reward[:, -1], bootstrap[:, -1])]
+    assert reward.shape == value.shape == is_last.shape == is_terminal.shape, reward.shape
+    value = torch.where(is_terminal, reward, value)  # nothing follows a terminal state
+    returns = [value[:, -1]]
     for t in reversed(range(reward.shape[1] - 1)):
-        after = (1 - lam) * bootstrap[:, t + 1] + lam * returns[-1]
-        value = torch.where(is_last[:, t], bootstrap[:, t], reward[:, t] + gamma * after)
-        returns.append(torch.where(is_terminal[:, t], reward[:, t], value))
+        after = (1 - lam) * value[:, t + 1] + lam * returns[-1]
+        ends = is_last[:, t] | is_terminal[:, t]
+        returns.append(torch.where(ends, value[:, t], reward[:, t] + gamma * after))
     return torch.stack(returns[::-1], 1)
 
 

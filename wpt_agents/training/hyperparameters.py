@@ -142,6 +142,23 @@ class Hyperparameters(Keywords):
         least=0,
     )
 
+    actor_grad: str = choice(
+        "dynamics",
+        ("dynamics", "reinforce"),
+        'gradient of the actor: through the dynamics, as in the paper, or "reinforce" (DreamerV3), '
+        "which needs no gradient through the dream",
+    )
+    repval_scale: float = amount(
+        0.0,
+        "weight of DreamerV3's replay value loss, which trains the critic on returns that were "
+        "earned; not in the paper. DreamerV3 has 0.3",
+    )
+    recent_share: float = share(
+        0.0,
+        "share of a batch's online sequences that are drawn from the five newest episodes; not in "
+        "the paper",
+    )
+
     # Collecting.
     learning_starts: int = count(
         5_000,

@@ -12,12 +12,19 @@ from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
     actor_loss,
     critic_loss,
+    discounts,
     draw_starts,
     ema_update,
     lambda_return,
     return_range,
 )
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, recent_frames
+from wpt_agents.model.dreamer_v3 import (
+    advantage,
+    reinforce_loss,
+    replay_return,
+    replay_value_loss,
+)
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
@@ -99,7 +106,12 @@ class Learner:
             imitation = imitation_weight * loss
         starts = self.draw_starts(batch, generator)
         start = post.flatten_time().pick(starts)
-        metrics |= self.update_behavior(start, starts, generator, imitation, head_start)
+        grounding = None
+        if self.hyperparameters.repval_scale:
+            loss = self.replay_value_loss(post, batch)
+            metrics["train/replay_value_loss"] = loss.detach()
+            grounding = self.hyperparameters.repval_scale * loss
+        metrics |= self.update_behavior(start, starts, generator, imitation, head_start, grounding)
         return metrics
 
     def update_world_model(
@@ -142,6 +154,23 @@ class Learner:
                 advice = policy.prior_actor.act(seen, mask)
             return bc_loss(policy.actor.dist(feat, mask).mode, advice, mask)
 
+    def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
+        """DreamerV3's replay value loss, on the rows whose rewards are known.
+
+        DreamerV3 bootstraps by the return of a dream from each replayed state. Here dreams start
+        from some of them only (`imagine_starts`), so the target critic's value stands for it.
+        """
+        settings = self.hyperparameters
+        with self.autocast():
+            with torch.no_grad():
+                value = self.policy.target_critic.value(post.feat)
+            ends = batch.is_first[:, 1:]
+            is_last = torch.cat([ends, torch.zeros_like(ends[:, :1])], 1)
+            returns = replay_return(
+                batch.reward, value, is_last, batch.is_terminal, settings.gamma, settings.lam
+            )
+            return replay_value_loss(self.policy.critic(post.feat), returns, batch.reward_known)
+
     def draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
         """Return the numbers of the batch's states to imagine from, (N,)."""
         number = self.hyperparameters.value("imagine_starts")
@@ -155,6 +184,7 @@ class Learner:
         generator: Generator,
         imitation: Tensor | None = None,
         head_start: bool = False,
+        grounding: Tensor | None = None,
     ) -> Metrics:
         """Train actor and critic on imagined trajectories, Eq. (2) to (4).
 
@@ -164,13 +194,17 @@ class Learner:
         :param start: (N, ...), the states to start from
         :param starts: (N,), their numbers in the batch
         :param imitation: added to the actor's loss, but not to the metric of it
+        :param grounding: added to the critic's loss, but not to the metric of it
         """
         policy = self.policy
         settings = self.hyperparameters
-        with self.autocast(), torch.set_grad_enabled(not head_start):
-            dream, reward, value, returns = self.imagine(start, starts, generator)
+        through_dream = settings.actor_grad == "dynamics" and not head_start
+        with self.autocast():
+            with torch.set_grad_enabled(through_dream):
+                imagined = self.imagine(start, starts, generator)
+            dream, reward, value, returns = imagined
             spread, scale = self.return_scale(returns)
-            loss = actor_loss(returns, dream.entropy, settings.ent_coef, settings.gamma, scale)
+            loss = self.actor_loss(imagined, scale)
         terms = [] if head_start else [loss]
         terms += [] if imitation is None else [imitation]
         actor_norm = torch.zeros_like(scale)
@@ -180,7 +214,8 @@ class Learner:
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
             value_loss = critic_loss(logits, returns, settings.gamma)
-        critic_norm = self.descend(self.critic_optimizer, value_loss, "critic")
+        total = value_loss if grounding is None else value_loss + grounding
+        critic_norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
         metrics = {
             "actor_loss": loss,
@@ -203,6 +238,27 @@ class Learner:
         value = over_steps(self.policy.target_critic.value, dream.states)
         returns = lambda_return(reward, value, settings.gamma, settings.lam)
         return Imagined(dream, reward, value, returns)
+
+    def actor_loss(self, imagined: Imagined, scale: Tensor) -> Tensor:
+        """Compute Eq. (4), or DreamerV3's REINFORCE on the actions of the dreams.
+
+        :param scale: what returns are divided by
+        """
+        settings = self.hyperparameters
+        dream, reward, value, returns = imagined
+        if settings.actor_grad == "dynamics":
+            return actor_loss(returns, dream.entropy, settings.ent_coef, settings.gamma, scale)
+        feat = dream.states.but_last().but_last().feat.detach()
+        dist = self.policy.actor.dist(feat, self.policy.action_mask)
+        weight = discounts(feat.shape[1], settings.gamma, like=returns)
+        return reinforce_loss(
+            dist.log_prob(dream.action[:, :-1].detach()),
+            advantage(reward, value, returns, settings.gamma),
+            dist.entropy(),
+            weight,
+            settings.ent_coef,
+            scale,
+        )
 
     def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
         """Return what arriving in the imagined states 0 .. H-1 pays, (N, H).

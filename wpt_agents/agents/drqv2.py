@@ -181,16 +181,16 @@ class DrQv2Learner:
     """One update of critic, encoder and actor.
 
     :param policy: whose networks learn
-    :param given: learning rate, τ and the noise's clip c
+    :param settings: learning rate, τ and the noise's clip c
     """
 
-    def __init__(self, policy: DrQv2Policy, given: DrQv2Keywords) -> None:
+    def __init__(self, policy: DrQv2Policy, settings: DrQv2Keywords) -> None:
         self.policy = policy
-        self.given = given
+        self.settings = settings
         value = [*policy.encoder.parameters(), *policy.critic.parameters()]
         value = [weight for weight in value if weight.requires_grad]  # R3M's encoder is frozen
-        self.critic_optimizer = Adam(value, given.learning_rate, fused=True)
-        self.actor_optimizer = Adam(policy.actor.parameters(), given.learning_rate, fused=True)
+        self.critic_optimizer = Adam(value, settings.learning_rate, fused=True)
+        self.actor_optimizer = Adam(policy.actor.parameters(), settings.learning_rate, fused=True)
 
     def update(
         self, batch: Transitions, std: float, generator: Generator | None = None
@@ -201,7 +201,7 @@ class DrQv2Learner:
         :param std: σ of the exploration schedule
         """
         policy = self.policy
-        clip = self.given.std_clip
+        clip = self.settings.std_clip
         embed = policy.encoder(batch.image)
         with torch.no_grad():  # the encoder has no target network: h' is of the present one
             next_embed = policy.encoder(batch.next_image)
@@ -216,7 +216,7 @@ class DrQv2Learner:
         with frozen(policy.critic):
             loss = actor_loss(policy.critic(embed, action))
         descend(self.actor_optimizer, loss, "actor")
-        ema_update(policy.target_critic, policy.critic, self.given.tau)
+        ema_update(policy.target_critic, policy.critic, self.settings.tau)
         return {
             "train/critic_loss": value_loss.detach(),
             "train/actor_loss": loss.detach(),
@@ -277,9 +277,9 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
 
     def update(self, metrics: Metrics) -> None:
         """Make one update on transitions of the replay buffer."""
-        given = self.hyperparameters
+        settings = self.hyperparameters
         std = self.std_now
-        batch = self.draw(self.replay_buffer, given.batch_size, given.n_steps)
+        batch = self.draw(self.replay_buffer, settings.batch_size, settings.n_steps)
         generator = self.streams.torch(Purpose.UPDATE, self.updates, self.device)
         for name, value in self.learner.update(batch, std, generator).items():
             metrics[name].append(value)

@@ -152,15 +152,15 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     def _related(self) -> list[int]:
         assert self.dataset is not None and self.env is not None
-        given, task = self.hyperparameters, self.hyperparameters.task
+        settings, task = self.hyperparameters, self.hyperparameters.task
         if task is None and self.env.has_attr("spec"):
             task = getattr(self.env.get_attr("spec")[0], "id", None)
         return related_trajectories(
             self.dataset,
             task,
-            given.embodiment,
+            settings.embodiment,
             self.policy.action_dim,
-            given.num_retrieve,
+            settings.num_retrieve,
             self.streams.numpy(Purpose.RETRIEVE, 0),
         )
 
@@ -174,16 +174,16 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         :param stream: another number for each batch of the same update
         """
         rng = np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
-        given = self.hyperparameters
-        shape = size, n_steps, given.gamma, self.policy.action_dim
+        settings = self.hyperparameters
+        shape = size, n_steps, settings.gamma, self.policy.action_dim
         seen = self.seen(replay)
-        pad = given.pad if seen is None else 0
+        pad = settings.pad if seen is None else 0
         batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen)
         return batch.to(self.device)
 
     def hyperparameters_changed(self) -> None:
         """Hand the keywords to the learner, and the learning rate to its optimisers."""
-        self.learner.given = self.hyperparameters
+        self.learner.settings = self.hyperparameters
         for optimizer in optimizers(self.learner).values():
             for group in optimizer.param_groups:
                 group["lr"] = self.hyperparameters.learning_rate

@@ -56,9 +56,9 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
 
     def make_policy(self) -> DrQv2Policy:
         """Make the networks, as wide as the environment's actions."""
-        given = self.hyperparameters
-        widths = given.channels, given.feature_dim, given.hidden_dim
-        size = SIZES[given.bc_size]
+        settings = self.hyperparameters
+        widths = settings.channels, settings.feature_dim, settings.hidden_dim
+        size = SIZES[settings.bc_size]
         return DrQv2Policy(self.observation_space, self.action_space, size, *widths)
 
     @property
@@ -71,13 +71,13 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         super().prepare(progress_bar)
         if self.retrieved is None or self.progress.cloned:
             return
-        given = self.hyperparameters
-        settings = Cloning(given.bc_steps, given.bc_batch_size, given.bc_learning_rate)
+        settings = self.hyperparameters
+        cloning = Cloning(settings.bc_steps, settings.bc_batch_size, settings.bc_learning_rate)
         trained = clone(
             self.policy.prior_actor,
             self.retrieved.trajectories,
             self.policy.action_mask,
-            settings,
+            cloning,
             self.streams,
             progress_bar,
         )

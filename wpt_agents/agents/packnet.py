@@ -110,7 +110,7 @@ def _owner(name: str) -> str:
 
 
 class PackNetLearner(DrQv2Learner):
-    """The update of DrQ-v2 that changes no weight of another owner. Adam begins anew.
+    """The update of DrQ-v2 that changes no weight of another owner. Its Adam is new.
 
     With moments of its own from before, Adam would move a weight whose gradient is zero.
 
@@ -119,8 +119,8 @@ class PackNetLearner(DrQv2Learner):
 
     policy: PackNetPolicy
 
-    def __init__(self, policy: PackNetPolicy, given: DrQv2Keywords, trains: int = FREE) -> None:
-        super().__init__(policy, given)
+    def __init__(self, policy: PackNetPolicy, settings: DrQv2Keywords, trains: int = FREE) -> None:
+        super().__init__(policy, settings)
         self.hooks = [
             weight.register_hook(partial(_masked, policy, name, trains))
             for name, weight in policy.managed()
@@ -181,8 +181,8 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
 
     def make_policy(self) -> PackNetPolicy:
         """Make the networks, as wide as the environment's actions."""
-        given = self.hyperparameters
-        widths = given.channels, given.feature_dim, given.hidden_dim
+        settings = self.hyperparameters
+        widths = settings.channels, settings.feature_dim, settings.hidden_dim
         return PackNetPolicy(self.observation_space, self.action_space, None, *widths)
 
     def make_learner(self) -> PackNetLearner:
@@ -195,12 +195,12 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
             before.close()
         return PackNetLearner(self.policy, self.hyperparameters, trains)
 
-    def restore(self, about: Mapping[str, Any], *args: Any) -> None:
+    def restore(self, contents: Mapping[str, Any], *args: Any) -> None:
         """Take over a model file; in a later task biases and layer norms are frozen."""
-        if about["counters"]["task"]:
+        if contents["counters"]["task"]:
             self.policy.freeze_rest()
             self.learner = self.make_learner()  # its optimisers leave out what is frozen
-        super().restore(about, *args)
+        super().restore(contents, *args)
 
     def policy_of(self, task: int) -> PackNetPolicy:
         """Return the policy of a task up to the present one, as it was when the task ended."""
@@ -238,7 +238,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
     def _retrain(self, progress_bar: bool) -> None:
         """Train the weights that the present task keeps, from its replay."""
         self.learner = self._learner_of(self.progress.task)
-        own = self.updates - self.progress.updates_before
-        updates = round(own * self.hyperparameters.retrain)
+        made = self.updates - self.progress.updates_before
+        updates = round(made * self.hyperparameters.retrain)
         for _ in tqdm(range(updates), desc="retrain", disable=not progress_bar):
             self.update(defaultdict(list))

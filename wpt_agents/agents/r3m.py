@@ -93,9 +93,11 @@ class R3MLearner(DrQv2Learner):
 
     policy: R3MPolicy
 
-    def __init__(self, policy: R3MPolicy, given: "R3MKeywords") -> None:
-        super().__init__(policy, given)
-        self.encoder_optimizer = Adam(policy.encoder.parameters(), given.learning_rate, fused=True)
+    def __init__(self, policy: R3MPolicy, settings: "R3MKeywords") -> None:
+        super().__init__(policy, settings)
+        self.encoder_optimizer = Adam(
+            policy.encoder.parameters(), settings.learning_rate, fused=True
+        )
 
     def pretrain(self, clips: Tensor, others: Tensor) -> dict[str, Tensor]:
         """One update of the encoder by `r3m_loss`.
@@ -154,10 +156,10 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
 
     def make_policy(self) -> R3MPolicy:
         """Make the networks, as wide as the environment's actions."""
-        given = self.hyperparameters
-        widths = given.channels, given.feature_dim, given.hidden_dim
-        own = self.observation_space, self.action_space, None
-        return R3MPolicy(*own, *widths, backbone=given.backbone)
+        settings = self.hyperparameters
+        widths = settings.channels, settings.feature_dim, settings.hidden_dim
+        spaces = self.observation_space, self.action_space
+        return R3MPolicy(*spaces, None, *widths, backbone=settings.backbone)
 
     def make_learner(self) -> R3MLearner:
         """Make the optimisers."""

@@ -161,13 +161,13 @@ class RLPDLearner:
     """One update of encoder, critics, actor and temperature, and of the reward ensemble if any.
 
     :param policy: whose networks learn
-    :param given: learning rate, τ and β
+    :param settings: learning rate, τ and β
     """
 
-    def __init__(self, policy: RLPDPolicy, given: RLPDKeywords) -> None:
+    def __init__(self, policy: RLPDPolicy, settings: RLPDKeywords) -> None:
         self.policy = policy
-        self.given = given
-        learning_rate = given.learning_rate
+        self.settings = settings
+        learning_rate = settings.learning_rate
         value = [*policy.encoder.parameters(), *policy.critic.parameters()]
         self.critic_optimizer = Adam(value, learning_rate, fused=True)
         self.actor_optimizer = Adam(policy.actor.parameters(), learning_rate, fused=True)
@@ -190,14 +190,16 @@ class RLPDLearner:
         metrics: dict[str, Tensor] = {}
         if policy.reward_members:
             ensemble = policy.reward_ensemble, self.reward_optimizer
-            reward, metrics = label(*ensemble, reward, latent, online, self.given.beta, generator)
+            reward, metrics = label(
+                *ensemble, reward, latent, online, self.settings.beta, generator
+            )
         embed = policy.encoder(batch.image)
         q = policy.critic(embed, batch.action)
         value_loss = critic_loss(q, td_target(reward, batch.discount, next_q))
         descend(self.critic_optimizer, value_loss, "critic")
         metrics |= self._update_actor(embed.detach(), generator)
-        ema_update(policy.target_encoder, policy.encoder, self.given.tau)
-        ema_update(policy.target_critic, policy.critic, self.given.tau)
+        ema_update(policy.target_encoder, policy.encoder, self.settings.tau)
+        ema_update(policy.target_critic, policy.critic, self.settings.tau)
         return metrics | {"train/critic_loss": value_loss.detach(), "train/q": q.detach().mean()}
 
     @torch.no_grad()
@@ -255,15 +257,15 @@ class RLPD(FrameAgent, keywords=RLPDKeywords):
 
     def make_policy(self) -> RLPDPolicy:
         """Make the networks, as wide as the environment's actions."""
-        given = self.hyperparameters
+        settings = self.hyperparameters
         return RLPDPolicy(
             self.observation_space,
             self.action_space,
-            channels=given.channels,
-            feature_dim=given.feature_dim,
-            hidden_dim=given.hidden_dim,
-            critics=given.critics,
-            reward_members=given.reward_members if given.label == "optimistic" else 0,
+            channels=settings.channels,
+            feature_dim=settings.feature_dim,
+            hidden_dim=settings.hidden_dim,
+            critics=settings.critics,
+            reward_members=settings.reward_members if settings.label == "optimistic" else 0,
         )
 
     def make_learner(self) -> RLPDLearner:

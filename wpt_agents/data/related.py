@@ -23,9 +23,13 @@ def related_trajectories(
     """
     own_width = [width == action_dim for width in dataset.action_dims]
     for name, names in ((task, dataset.tasks), (embodiment, dataset.embodiments)):
-        found = [i for i, n in enumerate(names) if name is not None and n == name and own_width[i]]
-        if found:
-            chosen = found if len(found) <= most else rng.choice(found, most, replace=False)
+        matching = [
+            i for i, n in enumerate(names) if name is not None and n == name and own_width[i]
+        ]
+        if matching:
+            chosen = matching
+            if len(matching) > most:
+                chosen = rng.choice(matching, most, replace=False).tolist()
             return sorted(int(i) for i in chosen)
     tasks, robots = (
         ", ".join(sorted({n for n in names if n})) or "none"

@@ -95,13 +95,13 @@ def read_r3m(path: str) -> dict[str, Tensor]:
 
     :raises ValueError: another layout
     """
-    held = torch.load(path, map_location="cpu", weights_only=True)
+    content = torch.load(path, map_location="cpu", weights_only=True)
     prefix = "module.convnet."
-    weights = held.get("r3m", {}) if isinstance(held, dict) else {}
-    found = {k.removeprefix(prefix): w for k, w in weights.items() if k.startswith(prefix)}
-    if not found:
+    weights = content.get("r3m", {}) if isinstance(content, dict) else {}
+    network = {k.removeprefix(prefix): w for k, w in weights.items() if k.startswith(prefix)}
+    if not network:
         raise ValueError(
             f"{path} does not hold R3M's network: no 'r3m' with names like '{prefix}conv1.weight'. "
             "Pass one of the files r3m_18.pt, r3m_34.pt or r3m_50.pt of its authors"
         )
-    return {k: w for k, w in found.items() if not k.startswith("fc.")}
+    return {k: w for k, w in network.items() if not k.startswith("fc.")}

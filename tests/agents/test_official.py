@@ -52,13 +52,13 @@ def expected():
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
-def computed(policy, given):
+def computed(policy, arrays):
     """Every output of the fixture, as `WPT` computes it when it learns."""
-    model, state = policy.world_model, Latent(given["deter"], given["stoch"])
+    model, state = policy.world_model, Latent(arrays["deter"], arrays["stoch"])
     policy.set_action_space(spaces.Box(-1.0, 1.0, (6,)))
-    embed, start = model.encoder(given["image"]), torch.zeros(5, 1, dtype=torch.bool)
+    embed, start = model.encoder(arrays["image"]), torch.zeros(5, 1, dtype=torch.bool)
     post, post_logits, prior_logits = model.rssm.observe(
-        embed[:, None], given["action"][:, None], start, state
+        embed[:, None], arrays["action"][:, None], start, state
     )
     actor = policy.actor.dist(state.feat, policy.action_mask)
     return {
@@ -94,8 +94,8 @@ def test_the_fast_paths_of_learning_compute_what_the_authors_code_computes(expec
 def test_the_reconstruction_error_is_that_of_the_authors_images(expected):
     latent = Latent(expected["deter"][:, None], expected["stoch"][:, None])
     error = tiny().policy.world_model.reconstruction_error(latent, expected["image"][:, None])
-    wanted = squared_error(to_unit(expected["image"]), expected["reconstruction"])
-    torch.testing.assert_close(error[:, 0], wanted, rtol=1e-5, atol=0)
+    truth = squared_error(to_unit(expected["image"]), expected["reconstruction"])
+    torch.testing.assert_close(error[:, 0], truth, rtol=1e-5, atol=0)
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from wpt_agents.files.official import WORLD_MODEL, parameter_names
-from wpt_agents.model.networks import SIZES
+from wpt_agents.model.sizes import SIZES
 from wpt_agents.model.world_model import WorldModel
 
 STATUS = Path("/proc/self/status")

@@ -17,8 +17,8 @@ from wpt_agents.files.official import (
     read_official,
     write_official,
 )
-from wpt_agents.model.networks import find_size
 from wpt_agents.model.policy import WPTPolicy
+from wpt_agents.model.sizes import find_size
 
 Path = str | os.PathLike[str]
 FROM_FILE = ("size", "max_action_dim")

@@ -143,8 +143,8 @@ class FastFilter:
         self.stoch_bias = from_stoch.bias
         width = size.deter // gru.blocks
         self.private = gru.hidden.weight[:, :width]
-        shared = gru.hidden.weight[:, width:].transpose(0, 1).flatten(1)  # (inputs, D)
-        self.shared = shared.t().contiguous().t()
+        # (inputs, D), of which each output's weights lie side by side in memory
+        self.shared = gru.hidden.weight[:, width:].transpose(1, 2).flatten(0, 1).t()
         self.hidden_bias = gru.hidden.bias
         self.norm = gru.norm
         self.gates = gru.gates.weight

@@ -306,3 +306,38 @@ def test_a_file_without_a_counter_is_refused_by_name(learnt, tmp_path):
     write_model(tmp_path / "old.zip", about, tensors)
     with pytest.raises(ValueError, match="lacks credit: it was written by an earlier"):
         WPT.load(tmp_path / "old.zip")
+
+
+# A world model to share
+
+
+def test_a_shared_world_model_holds_no_other_network_and_no_path(store, tmp_path):
+    model = pretrained(store, steps=3)
+    model.save_world_model(tmp_path / "shared.zip")
+    about, tensors = read_model(tmp_path / "shared.zip")
+    assert list(tensors) == ["world_model"] and "dataset" not in about
+    names = {".".join(name.split(".")[:2]) for name in tensors["world_model"]}
+    assert names == {"world_model.encoder", "world_model.rssm", "world_model.decoder"}
+    assert {tensor.dtype for tensor in tensors["world_model"].values()} == {torch.bfloat16}
+
+
+def test_a_shared_world_model_is_the_model_rounded_and_can_be_fine_tuned(store, tmp_path):
+    model = pretrained(store, steps=3)
+    model.save_world_model(tmp_path / "shared.zip")
+    loaded = WPT.load(tmp_path / "shared.zip", env=ClockEnv(), dataset=store)
+    assert loaded.pretrain_steps == 3
+    for part in ("encoder", "rssm", "decoder"):
+        kept = getattr(model.policy.world_model, part).state_dict()
+        for name, tensor in getattr(loaded.policy.world_model, part).state_dict().items():
+            assert torch.equal(tensor, kept[name].bfloat16().float()), name
+    loaded.learn(60)
+    assert loaded.updates > 0
+
+
+def test_a_shipped_model_is_found_by_its_name(store, tmp_path, monkeypatch):
+    pretrained(store).save_world_model(tmp_path / "toy-mid.zip")
+    shipped = {"toy-mid": tmp_path / "toy-mid.zip"}
+    monkeypatch.setattr("wpt_agents.training.model_files.shipped", lambda: shipped)
+    assert WPT.load("toy-mid").pretrain_steps == 2
+    with pytest.raises(FileNotFoundError, match="toy-tiny"):
+        WPT.load("toy-tiny")

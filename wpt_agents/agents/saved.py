@@ -198,14 +198,18 @@ class SavedAgent(KeywordAgent):
         :param exclude: accepted because SB3 has it; nothing optional is in the file
         :param include: likewise
         """
-        about = {
+        dataset = str(self.dataset.path) if self.dataset is not None else None
+        about = self.description() | {"dataset": dataset}
+        model_files.write(path, about, self.policy, self.learner)
+
+    def description(self) -> dict[str, Any]:
+        """Return what a model file says of this agent besides its tensors."""
+        return {
             "class": self.saved_as or type(self).__name__,
             "hyperparameters": self.hyperparameters.as_dict(),
             "action_space": space_as_dict(self.action_space),
-            "dataset": str(self.dataset.path) if self.dataset is not None else None,
             "counters": self.progress.as_dict(),
         }
-        model_files.write(path, about, self.policy, self.learner)
 
     @classmethod
     def load(
@@ -220,7 +224,8 @@ class SavedAgent(KeywordAgent):
     ) -> Self:
         """Read a model file.
 
-        :param path: the path given to `save`
+        :param path: the path given to `save`, or the name of a pre-trained world model that comes
+            with the library, such as "metaworld-mid"
         :param env: the environment to continue with
         :param custom_objects: accepted because SB3 has it
         :param print_system_info: print this system's versions, as SB3 does

@@ -41,6 +41,7 @@ from wpt_agents.training.guidance import draw_window
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.learner import Learner
+from wpt_agents.training.model_files import write_world_model
 from wpt_agents.training.progress import Progress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.retrieving import retrieve_ids
@@ -464,6 +465,15 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         if env is not None:
             model.set_env(env)
         return model
+
+    def save_world_model(self, path: str | os.PathLike[str]) -> None:
+        """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share.
+
+        `load` reads it. The other networks are then new, and so are the optimisers.
+
+        :param path: a file name that ends in .zip
+        """
+        write_world_model(path, self.description(), self.policy)
 
     def save_official(self, path: str | os.PathLike[str]) -> None:
         """Write the weights in the authors' format, so that their scripts can read them.

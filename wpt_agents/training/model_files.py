@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from wpt_agents.files.model_file import load_optimizer, optimizer_tensors, write_model
 
+WORLD_MODEL = "world_model"  # the group of tensors of a file that holds no other network
 ModelPath = str | os.PathLike[str] | BufferedIOBase
 
 
@@ -33,10 +34,30 @@ def write(path: ModelPath, about: Mapping[str, Any], policy: BasePolicy, learner
 def restore(
     tensors: Mapping[str, Mapping[str, Tensor]], policy: BasePolicy, learner: object
 ) -> None:
-    """Load the weights and the optimisers' averages of a model file. Learning rates stay."""
+    """Load the weights and the optimisers' averages of a model file. Learning rates stay.
+
+    Of a file that holds a world model alone, the policy's other networks stay as they are.
+    """
+    if WORLD_MODEL in tensors:
+        policy.load_state_dict({**policy.state_dict(), **tensors[WORLD_MODEL]})
+        return
     policy.load_state_dict(tensors["policy"])
     for name, value in optimizers(learner).items():
         load_optimizer(value, tensors[name])
+
+
+def write_world_model(path: ModelPath, about: Mapping[str, Any], policy: BasePolicy) -> None:
+    """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share."""
+    kept = tuple(f"world_model.{part}." for part in ("encoder", "rssm", "decoder"))
+    weights = {k: w.bfloat16() for k, w in policy.state_dict().items() if k.startswith(kept)}
+    write_model(path, about, {WORLD_MODEL: weights})
+
+
+def shipped() -> dict[str, Path]:
+    """Return the pre-trained world models that come with the library, by name."""
+    package = Path(__file__).parents[1]
+    folders = (package / "zoo" / "presets" / "models", package.parent / "zoo" / "models")
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.zip"))}
 
 
 def check_same(
@@ -59,11 +80,14 @@ def check_same(
 def find(path: ModelPath) -> ModelPath:
     """Return the path of an existing file, with the suffix that `write` adds where there is none.
 
+    :param path: a file, or the name of a shipped model if there is no such file
     :raises FileNotFoundError: a folder; the message lists the model files in it
     """
     if not isinstance(path, str | os.PathLike):
         return path
     path = Path(path)
+    if not path.exists() and str(path) in shipped():
+        return shipped()[str(path)]
     file = path if path.suffix else path.with_suffix(".zip")
     if path.is_dir() and not file.is_file():
         names = ", ".join(sorted(item.name for item in path.glob("*.zip"))) or "no model file"

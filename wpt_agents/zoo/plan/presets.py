@@ -64,10 +64,15 @@ class CollectSettings(Section):
 
 @dataclass(frozen=True)
 class PretrainSettings(Section):
-    """Pre-training of the world model, the same for every seed of a run."""
+    """Pre-training of the world model, the same for every seed of a run.
+
+    `model` names a model that comes with the library, which is then used and not trained again;
+    `model=` (empty) makes it by `steps` updates.
+    """
 
     steps: int = 200_000
     seed: int = 0
+    model: str = ""
 
 
 @dataclass(frozen=True)

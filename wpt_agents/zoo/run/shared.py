@@ -17,8 +17,9 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.files.names import counted
+from wpt_agents.files.names import counted, unknown_name
 from wpt_agents.training.distributed import World
+from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import BASELINES
@@ -80,6 +81,9 @@ def _warn_of_differences(shared: Shared) -> None:
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: the file of the pre-trained model, which is pre-trained unless it is finished."""
+    if name := shared.preset.pretrain.model:
+        say("pretrain", f"the shipped model {name}  [dim]{shipped_model(name)}")
+        return shipped_model(name)
     folder = shared.model_path
     world = World.current()
     model = folder / "model.zip"
@@ -97,6 +101,13 @@ def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
             if world.rank == 0:
                 write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
     return model
+
+
+def shipped_model(name: str) -> Path:
+    """Return the file of a model that comes with the library."""
+    if name not in shipped():
+        raise unknown_name("shipped model", name, shipped())
+    return shipped()[name]
 
 
 def _pretrain(shared: Shared, dataset: TrajectoryDataset, callback: Callback | None) -> None:

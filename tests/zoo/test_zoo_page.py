@@ -235,3 +235,16 @@ def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
     make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
     [told] = headline.both_suites(read_results(tmp_path))
     assert told.ours == pytest.approx((0.5 + 0.1) / 2)
+
+
+def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):
+    words = text(page)
+    assert "Figure 2: six tasks, all methods" in words
+    assert "dmc-cheetah-run-hard: no run" in words
+    lacking = "no run of 6 methods, drq-v2, dreamer-v3, r3m, jsrl-bc, uds, explore"
+    assert f"dmc-walker-run: {lacking}" in words
+    figure = page[page.index('id="figure-2"') : page.index('id="table-')]
+    assert figure.count("<svg") == 1 and "metaworld-reach" not in figure
+    make_run(tmp_path / "other", "metaworld-reach", 0, "wpt", (9.0, 1.0))
+    write_page(tmp_path / "other", tmp_path / "other.html")
+    assert "Figure 2" not in text((tmp_path / "other.html").read_text())

@@ -3,6 +3,7 @@
 To add a method of WPT, add one entry to `METHODS` with the keywords that differ from the preset.
 To add another agent, write it as a file of `wpt_agents/agents/` and name its class here::
 
+    "dreamer-v3": Method(keywords=DREAMER_V3, pretrained=False, needs_data=False),
     "drq-v2": Method(DrQv2, shared=(), policy="CnnPolicy", pretrained=False, needs_data=False),
 
 With a name in `AGENTS` it has a section in the presets, whose keys are its keywords; a subclass
@@ -116,6 +117,21 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
 
 
 ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
+# DreamerV3 from scratch, by the settings of its code for images of DMControl. Left out are its
+# optimiser, norms and pooling, the spacing of its bins, the regulariser of its critic, and the
+# continue head, which makes no difference where no episode ends early.
+DREAMER_V3 = {
+    **ALONE,
+    "gamma": 0.997,
+    "imagine_horizon": 15,
+    "ent_coef": 3e-4,
+    "return_norm": True,
+    "zero_init_heads": True,
+    "free_nats_mode": "element",
+    "actor_outscale": 0.01,
+    "actor_grad": "reinforce",
+    "repval_scale": 0.3,
+}
 MODEL_FREE: dict[str, Any] = {"pretrained": False, "shared": (), "policy": "CnnPolicy"}
 METHODS = {
     "wpt": Method(),
@@ -128,6 +144,7 @@ METHODS = {
     "no-rehearsal": Method(keywords={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
     "random-retrieval": Method(keywords={"retrieval": "random"}),
+    "dreamer-v3": Method(keywords=DREAMER_V3, pretrained=False, needs_data=False),
     "drq-v2": Method(DrQv2, **MODEL_FREE, needs_data=False),
     "r3m": Method(R3M, shared=(), policy="CnnPolicy"),
     "jsrl-bc": Method(JSRL, **MODEL_FREE),

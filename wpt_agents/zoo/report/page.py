@@ -11,7 +11,7 @@ import yaml
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted, unknown_name
-from wpt_agents.zoo.report import aggregates, headline, paper_tables, sections, tables
+from wpt_agents.zoo.report import aggregates, figure2, headline, paper_tables, sections, tables
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
 from wpt_agents.zoo.report.names import policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
@@ -53,6 +53,7 @@ def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: st
             sections.section(suite, runs, names)
             for suite in dict.fromkeys(result.suite for result in results)
         ],
+        figure_2=figure2.figure_2(runs, names),
         tables=paper_tables.paper_tables(runs, names),
         policies=tables.by_task(tables.policies(results)),
         policy_cells=tables.policy_cells,

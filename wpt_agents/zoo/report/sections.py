@@ -196,18 +196,24 @@ def draw_ablation(
 
 def curves(suite: str, runs: Sequence[Finished], names: Names) -> list[str]:
     """Draw a figure for each task: evaluations over frames, their mean and interval over seeds."""
-    tasks: dict[str, dict[Experiment, list[tuple[np.ndarray, np.ndarray]]]] = {}
+    tasks = dict.fromkeys(run.result.task for run in runs if run.result.suite == suite)
+    drawn = [task_curves(task, runs, names) for task in tasks]
+    return [figure for figure in drawn if figure is not None]
+
+
+def task_curves(task: str, runs: Sequence[Finished], names: Names) -> str | None:
+    """Draw the curves of a task, one for each experiment; None if no run was evaluated."""
+    experiments: dict[Experiment, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
+    metric = ""
     for run in runs:
-        if run.result.suite == suite and (evaluations := run.evaluations()):
-            experiments = tasks.setdefault(run.result.task, {})
-            experiments.setdefault(run.experiment, []).append(evaluations)
-    metrics = {run.result.task: run.result.metric for run in runs}
-    drawn = []
-    for task, experiments in tasks.items():
-        lines = [curve(names(one), seeds) for one, seeds in experiments.items()]
-        y_label = "success rate" if metrics[task] == "success" else "return"
-        drawn.append(figures.lines(task, "simulator frames", y_label, lines, names.all))
-    return drawn
+        if run.result.task == task and (evaluations := run.evaluations()):
+            experiments[run.experiment].append(evaluations)
+            metric = run.result.metric
+    if not experiments:
+        return None
+    lines = [curve(names(one), seeds) for one, seeds in experiments.items()]
+    y_label = "success rate" if metric == "success" else "return"
+    return figures.lines(task, "simulator frames", y_label, lines, names.all)
 
 
 def curve(label: str, seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> figures.Line:

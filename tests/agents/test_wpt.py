@@ -28,6 +28,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.ops import definitions
 from wpt_agents.model.policy import prior_action, stack_frames
 from wpt_agents.training import cloning, pretraining
 from wpt_agents.training.learner import Learner
@@ -555,10 +556,11 @@ def test_held_out_errors_are_a_squared_error_an_image_and_an_absolute_one_a_rewa
     model, episode = agent(ClockEnv()), recorded(length=6)
     episode = replace(episode, reward=np.arange(6, dtype=np.float32))
     world_model = model.policy.world_model
-    grey, three = torch.zeros(7, 32, 32, 12), torch.full((1, 7), 3.0)  # 0: between black and white
-    monkeypatch.setattr(world_model.decoder, "parities", lambda code: grey)
+    grey, three = torch.zeros(7, 64, 64, 3), torch.full((1, 7), 3.0)  # 0: between black and white
+    monkeypatch.setattr(world_model.decoder, "forward", lambda deter, stoch: grey)
     monkeypatch.setattr(world_model, "reward", lambda feat: three)
-    errors = model.policy.heldout_errors(episode)
+    with definitions():
+        errors = model.policy.heldout_errors(episode)
     by_hand = ((episode.image / 255 - 0.5) ** 2).sum((1, 2, 3)).mean()
     assert errors["reconstruction"] == pytest.approx(by_hand, rel=1e-4)
     assert errors["reward"] == pytest.approx(np.mean([3, 2, 1, 0, 1, 2]))

@@ -156,7 +156,8 @@ def test_run_is_refused_under_torchrun(monkeypatch, capsys):
 def test_two_processes_learn_what_one_does(pair, alone, name):
     seen, after = torch.load(pair / f"{name}-0.pt")
     assert list(seen) == [1, 2, 3, 4, 5, 6]
-    assert_equal(seen, after, *alone[name], 2e-2 if name == "bf16" else 1e-4)
+    # bf16 keeps 8 bits, and rounding can change which class of a latent is drawn
+    assert_equal(seen, after, *alone[name], 5e-2 if name == "bf16" else 1e-4)
 
 
 @pytest.mark.parametrize("name", [*JOBS, "unseeded"])

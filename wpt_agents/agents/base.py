@@ -168,6 +168,13 @@ class PixelAgent(SavedAgent):
             callback.on_rollout_end()
         return go_on
 
+    def first_image(self) -> np.ndarray:
+        """Return the first image of the first environment's open episode, (1, 64, 64, 3)."""
+        frame = to_images(self._last_obs)[0][0]
+        if self.rollout is not None and not self._last_episode_starts.all():
+            frame = next(iter(self.rollout.images[0]), frame)
+        return frame[None]
+
     def _open_rollout(self) -> Rollout:
         """Return the open episodes; new ones if all environments were just reset."""
         if self.rollout is None or self._last_episode_starts.all():

@@ -283,8 +283,9 @@ class Explorer(WPT):
             self._last_obs = self.env.reset()
             self._last_episode_starts = np.ones(1, bool)
             self.rollout = None  # no half-played episode
-            self.collect(callback, 0)
-            self.update_models()
+            with self.operations():
+                self.collect(callback, 0)
+                self.update_models()
             yield self.replay_buffer.trajectories[-1]
 
 

@@ -12,72 +12,39 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv
 
-from wpt_agents.agents.base import Metrics, PixelAgent
-from wpt_agents.agents.official import export_model, import_model
+from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.convert import Data
-from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer, mix
-from wpt_agents.data.retrieval import Retriever
-from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.fast.compiled import compile_loops
 from wpt_agents.files.model_file import read_model
-from wpt_agents.model.policy import PriorPolicy, WPTPolicy, prior_action, to_images
-from wpt_agents.model.sizes import Size, find_size
+from wpt_agents.model.policy import prior_action
+from wpt_agents.model.sizes import Size
 from wpt_agents.training import pretraining
-from wpt_agents.training.checks import check_dataset, check_trajectory
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.distributed import World, joined, local_device
 from wpt_agents.training.guidance import draw_window
-from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.keywords import Stage
-from wpt_agents.training.learner import Learner
-from wpt_agents.training.model_files import write_world_model
-from wpt_agents.training.progress import Progress
+from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.retrieving import retrieve_ids
 from wpt_agents.training.rollout import Window
-from wpt_agents.training.spaces import check_spaces
 
 NO_DATASET = (
     "No dataset: nothing is rehearsed, no prior actor guides or is imitated, and model.prior stays "
     "None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, kickstart=0 if this "
     "is intended"
 )
-INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior is adapted to
 Callback = Callable[[int, dict[str, float]], Any]
 
 
-@dataclass(kw_only=True)
-class WPTProgress(Progress):
-    """Counters of WPT.
-
-    :ivar pretrain_steps: updates of the world model in pre-training
-    :ivar task_updates: updates for the present task
-    :ivar initialised: whether a new world model was adapted to its data
-    :ivar cloned: whether the prior actor is trained
-    :ivar retrieved_ids: numbers of the retrieved trajectories in the dataset
-    :ivar retrieved_of: fingerprint of that dataset
-    """
-
-    pretrain_steps: int = 0
-    task_updates: int = field(default=0, metadata={"earlier": 0})
-    initialised: bool = field(default=False, metadata={"earlier": True})
-    cloned: bool = False
-    retrieved_ids: list[int] = field(default_factory=list)
-    retrieved_of: str = ""
-
-
-class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
+class WPT(WorldModelAgent, progress=WPTProgress):
     """Generalist world-model pre-training and fine-tuning, with Stable-Baselines3's verbs.
 
     Example::
@@ -97,50 +64,10 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
     :param device: "auto", "cpu", "cuda", ...
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"WPTPolicy": WPTPolicy}
     saved_as = "WPT"
-    shape_keywords = ("size", "max_action_dim")
     warmup_pays = True
-    policy: WPTPolicy
-    learner: Learner
-    hyperparameters: Hyperparameters
     progress: WPTProgress
     retrieved: ReplayBuffer | None = None  # D_retrieval
-
-    # The networks
-
-    def make_policy(self) -> WPTPolicy:
-        """Make all networks, for actions of any width up to `max_action_dim`."""
-        settings = self.hyperparameters
-        policy = WPTPolicy(
-            self.observation_space,
-            self.unbound_action_space(),
-            find_size(settings.size),
-            settings.max_action_dim,
-            settings.unimix,
-            settings.value("zero_init_heads"),
-            settings.actor_outscale,
-        ).to(self.device)
-        if settings.compile:
-            compile_loops(policy)
-        return policy
-
-    def make_learner(self) -> Learner:
-        """Make the optimisers."""
-        return Learner(self.policy, self.hyperparameters)
-
-    def unbound_action_space(self) -> spaces.Box:
-        """Return the action space of a model without an environment, which is padded."""
-        return spaces.Box(-1.0, 1.0, (self.hyperparameters.max_action_dim,), np.float32)
-
-    def adapt_to_data(self, data: TrajectoryDataset | ReplayBuffer) -> None:
-        """Standardise a new world model's posterior by 512 images of the data, once."""
-        settings = self.hyperparameters
-        if settings.data_dependent_init and not self.progress.initialised:
-            rng = self.streams.numpy(Purpose.INITIALISE, 0)
-            batch = data.sample(*INITIAL_IMAGES, settings.max_action_dim, rng)
-            self.policy.world_model.standardise(batch.image.flatten(0, 1).to(self.device))
-        self.progress.initialised = True
 
     # // Task-Agnostic World Model Pre-Training
 
@@ -187,7 +114,8 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
             if path is not None and path.exists():
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
                 model.restore(*read_model(path), same)
-            model._pretrain(world, steps, accumulate, path, progress_bar, callback)
+            with model.operations():
+                model._pretrain(world, steps, accumulate, path, progress_bar, callback)
         if env is not None:
             model.set_env(env)
         return model
@@ -239,9 +167,12 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         :param log_interval: episodes between two dumps of the log
         :return: the model itself
         """
-        with self.learning(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        ) as callback:
+        with (
+            self.operations(),
+            self.learning(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            ) as callback,
+        ):
             self.retrieve(progress_bar)
             self.clone(progress_bar)
             while self.unfinished and self.collect(callback, log_interval):
@@ -304,26 +235,7 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         """Act as the prior actor; at random in the warm-up if there is none."""
         return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)
 
-    def expected_length(self) -> int:
-        """Return an episode's steps: the keyword, the longest so far, the environment's, or 500."""
-        if length := self.hyperparameters.episode_length or self.progress.seen_length:
-            return length
-        assert self.env is not None
-        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
-        return getattr(spec, "max_episode_steps", None) or 500
-
-    def on_episode(self, trajectory: Trajectory) -> None:
-        """Log how well the world model predicts an episode that it has not replayed yet."""
-        for name, error in self.policy.heldout_errors(trajectory).items():
-            self.logger.record_mean(f"train/heldout_{name}_error", error)
-
     # // Update Models
-
-    @property
-    def updates_per_step(self) -> float:
-        """How many updates a collected step pays for; an update replays B x T steps."""
-        settings = self.hyperparameters
-        return settings.train_ratio / (settings.batch_size * settings.batch_length)
 
     def updates_due(self) -> int:
         """Return how many updates to make now: those that are paid for, or the head start."""
@@ -350,17 +262,14 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         if head_start and progress.cloned:
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
-        for name, value in self.learner.update(batch, generator, imitation, head_start).items():
+        with self.operations():
+            found = self.learner.update(batch, generator, imitation, head_start)
+        for name, value in found.items():
             metrics[name].append(value)
         progress.updates += 1
         progress.task_updates += 1
 
-    # The data, the task and the keywords
-
-    def check_data(self, dataset: TrajectoryDataset) -> None:
-        """Refuse a dataset that WPT cannot learn from."""
-        settings = self.hyperparameters
-        check_dataset(dataset, settings.max_action_dim, settings.batch_length)
+    # The data and the task
 
     def set_dataset(self, dataset: Data | None) -> None:
         """Use another D_off: whatever `open_dataset` takes, other people's files too."""
@@ -368,14 +277,10 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
             self.retrieved = None
 
-    def check_env(self, env: VecEnv) -> None:
-        """Refuse an environment that WPT cannot act in."""
-        check_spaces(env, self.hyperparameters.max_action_dim)
-
-    def on_other_actions(self) -> None:
-        """Begin a new task if one was begun: its episodes and behaviour have another width."""
-        if self.progress.episodes or self.progress.retrieved_ids:
-            self.reset_task()
+    @property
+    def begun(self) -> bool:
+        """Whether anything was done for a task."""
+        return self.progress.episodes > 0 or bool(self.progress.retrieved_ids)
 
     def reset_task(self) -> None:
         """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.
@@ -383,7 +288,7 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         The optimisers, also that of the world model, start with new averages.
         """
         self.retrieved = None
-        self.progress.reset("retrieved_ids", "cloned", "task_updates")
+        self.progress.reset("retrieved_ids")
         super().reset_task()
 
     def too_late(self, stage: Stage) -> str | None:
@@ -393,93 +298,3 @@ class WPT(PixelAgent, keywords=Hyperparameters, progress=WPTProgress):
         if stage is Stage.CLONING and self.progress.cloned:
             return "the prior actor is cloned; call reset_task() first"
         return super().too_late(stage)
-
-    def hyperparameters_changed(self) -> None:
-        """Let the learner use the changed keywords, if they suit the dataset."""
-        if self.dataset is not None:
-            self.check_data(self.dataset)
-        self.learner.configure(self.hyperparameters)
-
-    # What a model can show
-
-    def first_image(self) -> np.ndarray:
-        """Return the first image of the first environment's open episode, (1, 64, 64, 3)."""
-        frame = to_images(self._last_obs)[0][0]
-        if self.rollout is not None and not self._last_episode_starts.all():
-            frame = next(iter(self.rollout.images[0]), frame)
-        return frame[None]
-
-    def build_index(self, progress_bar: bool = False) -> Retriever:
-        """Return the index of the dataset's first images, which is kept beside the dataset."""
-        if self.dataset is None:
-            raise ValueError("No dataset to index: pass dataset= to load or WPT")
-        policy = self.policy
-        return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
-
-    @property
-    def prior(self) -> PriorPolicy | None:
-        """The prior actor, with `predict`; None before it is cloned."""
-        return PriorPolicy(self.policy) if self.progress.cloned else None
-
-    def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """Predict a trajectory's images, (T, 64, 64, 3) uint8, from the first `context` of them.
-
-        :raises ValueError: no context, more actions than the model takes, images of another size
-        """
-        if context < 1:
-            raise ValueError(
-                f"context, the number of images seen, must be at least 1, got {context}"
-            )
-        check_trajectory(trajectory, self.hyperparameters.max_action_dim)
-        return self.policy.open_loop(trajectory, context, horizon)
-
-    # The authors' own weights
-
-    @classmethod
-    def from_official(
-        cls,
-        path: str | os.PathLike[str],
-        env: GymEnv | str | None = None,
-        dataset: Data | None = None,
-        stoch: int | None = None,
-        **kwargs: Any,
-    ) -> Self:
-        """Read a model file of the paper's authors, such as `dmcontrol.pt`.
-
-        The widths and `max_action_dim` are inferred from the shapes. Reward head, actor, critic and
-        target critic are read if the file has them, and drawn if it has not.
-
-        :param path: a `torch.save` file of nested state dicts; it is read with `weights_only=True`
-        :param env: the environment to continue with
-        :param dataset: D_off, such as the authors' folder `ncrl_datasets/dmcontrol`
-        :param stoch: groups of z, if they are not the authors' 32
-        :param kwargs: further keywords of `WPT`
-        :raises FileNotFoundError: no such file
-        :raises ValueError: a file that is cut short, damaged, holds more than weights or is not of
-            the authors
-        """
-        cls.check_keywords(kwargs)
-        lean = cls is WPT  # explorers have networks of their own
-        model: Self = import_model(cls, path, stoch, lean, **kwargs)
-        model.set_dataset(dataset)
-        if env is not None:
-            model.set_env(env)
-        return model
-
-    def save_world_model(self, path: str | os.PathLike[str]) -> None:
-        """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share.
-
-        `load` reads it. The other networks are then new, and so are the optimisers.
-
-        :param path: a file name that ends in .zip
-        """
-        write_world_model(path, self.description(), self.policy)
-
-    def save_official(self, path: str | os.PathLike[str]) -> None:
-        """Write the weights in the authors' format, so that their scripts can read them.
-
-        Actor, critic, target critic and reward head are written, too, trained or not.
-
-        :raises ValueError: a model whose `Size` has other `gates` or `norm_eps` than the authors'
-        """
-        export_model(self.policy, path)

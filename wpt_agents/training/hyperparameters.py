@@ -77,6 +77,13 @@ class Hyperparameters(Keywords):
         Stage.SIZE,
     )
 
+    fast: bool = switch(
+        True,
+        "compute by the faster twins in `wpt_agents.fast` of what `wpt_agents.model` defines; "
+        "False, for debugging, by the definitions alone",
+        Stage.ACTING,
+    )
+
     # The world model, in pre-training and in fine-tuning.
     batch_size: int = count(16, "B, sequences in a batch", Stage.PRETRAINING)
     batch_length: int = count(64, "T, images in a sequence", Stage.PRETRAINING)

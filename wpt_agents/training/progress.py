@@ -1,7 +1,7 @@
 """How far an agent has come: everything that its model file holds besides weights and keywords."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from typing import Any, Self
 
 RENAMED = {"_windows_drawn": "windows_drawn", "_seen_length": "seen_length"}  # since version 0.1
@@ -56,3 +56,31 @@ class Progress:
             if item.name in names:
                 made = item.default if item.default_factory is MISSING else item.default_factory()
                 setattr(self, item.name, made)
+
+
+@dataclass(kw_only=True)
+class WorldModelProgress(Progress):
+    """Counters of an agent with WPT's networks.
+
+    :ivar pretrain_steps: updates of the world model in pre-training
+    :ivar task_updates: updates for the present task
+    :ivar initialised: whether a new world model was adapted to its data
+    :ivar cloned: whether the prior actor is trained
+    """
+
+    pretrain_steps: int = 0
+    task_updates: int = field(default=0, metadata={"earlier": 0})
+    initialised: bool = field(default=False, metadata={"earlier": True})
+    cloned: bool = False
+
+
+@dataclass(kw_only=True)
+class WPTProgress(WorldModelProgress):
+    """Counters of WPT.
+
+    :ivar retrieved_ids: numbers of the retrieved trajectories in the dataset
+    :ivar retrieved_of: fingerprint of that dataset
+    """
+
+    retrieved_ids: list[int] = field(default_factory=list)
+    retrieved_of: str = ""

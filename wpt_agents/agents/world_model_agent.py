@@ -1,0 +1,231 @@
+"""An agent with WPT's networks: how they are made, adapted, kept for other tasks and shown."""
+
+import os
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from wpt_agents.agents.base import PixelAgent
+from wpt_agents.agents.official import export_model, import_model
+from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.data.retrieval import Retriever
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.fast.compiled import compile_loops
+from wpt_agents.model.ops import definitions
+from wpt_agents.model.policy import PriorPolicy, State, WPTPolicy
+from wpt_agents.model.sizes import find_size
+from wpt_agents.training.checks import check_dataset, check_trajectory
+from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.training.learner import Learner
+from wpt_agents.training.model_files import write_world_model
+from wpt_agents.training.progress import WorldModelProgress
+from wpt_agents.training.randomness import Purpose
+from wpt_agents.training.spaces import check_spaces
+
+INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior is adapted to
+
+
+class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelProgress):
+    """An agent with a world model, an actor, a critic and a prior actor.
+
+    `WPT` adds what they learn and when.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"WPTPolicy": WPTPolicy}
+    shape_keywords = ("size", "max_action_dim")
+    policy: WPTPolicy
+    learner: Learner
+    hyperparameters: Hyperparameters
+    progress: WorldModelProgress
+
+    # The networks
+
+    def make_policy(self) -> WPTPolicy:
+        """Make all networks, for actions of any width up to `max_action_dim`."""
+        settings = self.hyperparameters
+        policy = WPTPolicy(
+            self.observation_space,
+            self.unbound_action_space(),
+            find_size(settings.size),
+            settings.max_action_dim,
+            settings.unimix,
+            settings.value("zero_init_heads"),
+            settings.actor_outscale,
+        ).to(self.device)
+        if settings.compile:
+            compile_loops(policy)
+        return policy
+
+    def make_learner(self) -> Learner:
+        """Make the optimisers."""
+        return Learner(self.policy, self.hyperparameters)
+
+    def unbound_action_space(self) -> spaces.Box:
+        """Return the action space of a model without an environment, which is padded."""
+        return spaces.Box(-1.0, 1.0, (self.hyperparameters.max_action_dim,), np.float32)
+
+    def adapt_to_data(self, data: TrajectoryDataset | ReplayBuffer) -> None:
+        """Standardise a new world model's posterior by 512 images of the data, once."""
+        settings = self.hyperparameters
+        if settings.data_dependent_init and not self.progress.initialised:
+            rng = self.streams.numpy(Purpose.INITIALISE, 0)
+            batch = data.sample(*INITIAL_IMAGES, settings.max_action_dim, rng)
+            self.policy.world_model.standardise(batch.image.flatten(0, 1).to(self.device))
+        self.progress.initialised = True
+
+    def operations(self) -> AbstractContextManager[None]:
+        """Return the context that the networks compute in, by the keyword `fast`."""
+        return nullcontext() if self.hyperparameters.fast else definitions()
+
+    # Collecting and learning
+
+    @property
+    def updates_per_step(self) -> float:
+        """How many updates a collected step pays for; an update replays B x T steps."""
+        settings = self.hyperparameters
+        return settings.train_ratio / (settings.batch_size * settings.batch_length)
+
+    def expected_length(self) -> int:
+        """Return an episode's steps: the keyword, the longest so far, the environment's, or 500."""
+        if length := self.hyperparameters.episode_length or self.progress.seen_length:
+            return length
+        assert self.env is not None
+        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+        return getattr(spec, "max_episode_steps", None) or 500
+
+    def on_episode(self, trajectory: Trajectory) -> None:
+        """Log how well the world model predicts an episode that it has not replayed yet."""
+        for name, error in self.policy.heldout_errors(trajectory).items():
+            self.logger.record_mean(f"train/heldout_{name}_error", error)
+
+    # The data, the task and the keywords
+
+    def check_data(self, dataset: TrajectoryDataset) -> None:
+        """Refuse a dataset that WPT cannot learn from."""
+        settings = self.hyperparameters
+        check_dataset(dataset, settings.max_action_dim, settings.batch_length)
+
+    def check_env(self, env: VecEnv) -> None:
+        """Refuse an environment that WPT cannot act in."""
+        check_spaces(env, self.hyperparameters.max_action_dim)
+
+    def on_other_actions(self) -> None:
+        """Begin a new task if one was begun: its episodes and behaviour have another width."""
+        if self.begun:
+            self.reset_task()
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything was done for a task."""
+        return self.progress.episodes > 0
+
+    def reset_task(self) -> None:
+        """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.
+
+        The optimisers, also that of the world model, start with new averages.
+        """
+        self.progress.reset("cloned", "task_updates")
+        super().reset_task()
+
+    def hyperparameters_changed(self) -> None:
+        """Let the learner use the changed keywords, if they suit the dataset."""
+        if self.dataset is not None:
+            self.check_data(self.dataset)
+        self.learner.configure(self.hyperparameters)
+
+    # What a model can show
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """Return actions for observations and the state for the next call; see `WPTPolicy`."""
+        with self.operations():
+            return self.policy.predict(observation, state, episode_start, deterministic)
+
+    @property
+    def prior(self) -> PriorPolicy | None:
+        """The prior actor, with `predict`; None before it is cloned."""
+        return PriorPolicy(self.policy) if self.progress.cloned else None
+
+    def build_index(self, progress_bar: bool = False) -> Retriever:
+        """Return the index of the dataset's first images, which is kept beside the dataset."""
+        if self.dataset is None:
+            raise ValueError("No dataset to index: pass dataset= to load or WPT")
+        policy = self.policy
+        with self.operations():
+            return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
+
+    def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
+        """Predict a trajectory's images, (T, 64, 64, 3) uint8, from the first `context` of them.
+
+        :raises ValueError: no context, more actions than the model takes, images of another size
+        """
+        if context < 1:
+            raise ValueError(
+                f"context, the number of images seen, must be at least 1, got {context}"
+            )
+        check_trajectory(trajectory, self.hyperparameters.max_action_dim)
+        with self.operations():
+            return self.policy.open_loop(trajectory, context, horizon)
+
+    # Weights for others, and the authors' own
+
+    @classmethod
+    def from_official(
+        cls,
+        path: str | os.PathLike[str],
+        env: GymEnv | str | None = None,
+        dataset: Data | None = None,
+        stoch: int | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Read a model file of the paper's authors, such as `dmcontrol.pt`.
+
+        The widths and `max_action_dim` are inferred from the shapes. Reward head, actor, critic and
+        target critic are read if the file has them, and drawn if it has not.
+
+        :param path: a `torch.save` file of nested state dicts; it is read with `weights_only=True`
+        :param env: the environment to continue with
+        :param dataset: D_off, such as the authors' folder `ncrl_datasets/dmcontrol`
+        :param stoch: groups of z, if they are not the authors' 32
+        :param kwargs: further keywords of `WPT`
+        :raises FileNotFoundError: no such file
+        :raises ValueError: a file that is cut short, damaged, holds more than weights or is not of
+            the authors
+        """
+        cls.check_keywords(kwargs)
+        lean = cls.make_policy is WorldModelAgent.make_policy  # explorers have further networks
+        model: Self = import_model(cls, path, stoch, lean, **kwargs)
+        model.set_dataset(dataset)
+        if env is not None:
+            model.set_env(env)
+        return model
+
+    def save_world_model(self, path: str | os.PathLike[str]) -> None:
+        """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share.
+
+        `load` reads it. The other networks are then new, and so are the optimisers.
+
+        :param path: a file name that ends in .zip
+        """
+        write_world_model(path, self.description(), self.policy)
+
+    def save_official(self, path: str | os.PathLike[str]) -> None:
+        """Write the weights in the authors' format, so that their scripts can read them.
+
+        Actor, critic, target critic and reward head are written, too, trained or not.
+
+        :raises ValueError: a model whose `Size` has other `gates` or `norm_eps` than the authors'
+        """
+        export_model(self.policy, path)

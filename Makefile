@@ -1,4 +1,4 @@
-# Three commands on a bare machine (Python 3.11+, git, a shell):
+# Three commands on a bare machine (Python 3.12 or 3.11, git, a shell):
 #   make demo       installs, then runs the whole method on one task in minutes
 #   make test       installs, then runs the tests
 #   make learn      the test that learns from scratch, three seeds of some minutes each
@@ -12,7 +12,9 @@
 #   make linkcheck  looks up every link of the documentation (needs the network)
 # They make .venv when it is not there. Nothing outside this folder is written.
 
-PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13,$(if $(shell $(p) -c "import sys; print(sys.version_info >= (3, 11) or '')" 2>/dev/null),$(p))))
+# The simulators have wheels for Python 3.11 and 3.12: 3.12 is taken if both are here.
+RIGHT_PYTHON := import sys; print(sys.version_info[:2] in ((3, 11), (3, 12)) or '')
+PYTHON ?= $(firstword $(foreach p,python3.12 python3.11 python3,$(if $(shell $(p) -c "$(RIGHT_PYTHON)" 2>/dev/null),$(p))))
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -35,9 +37,8 @@ help:
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml
-	@test -n "$(PYTHON)" && $(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { \
-	  echo "Python 3.11 or newer is needed; found: $$($(or $(PYTHON),python3) --version 2>&1)."; \
-	  echo "Install one, or name it: make PYTHON=/path/to/python3.11"; exit 1; }
+	@test -n "$(PYTHON)" && test -n "$$($(PYTHON) -c "$(RIGHT_PYTHON)")" || { \
+	  echo "Python 3.12 or 3.11 is needed, for the simulators, and $(or $(PYTHON),python3) is $$($(or $(PYTHON),python3) --version 2>&1): install one, or name it by make PYTHON=/path/to/python3.12"; exit 1; }
 	@echo "[install 1/4] an environment in $(VENV), from $(PYTHON) ($$($(PYTHON) --version))"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 	  echo "Could not make $(VENV). On Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
@@ -46,7 +47,7 @@ $(INSTALLED): pyproject.toml
 	  echo "              not to be had; taking the newest of $(TORCH_RANGE)"; \
 	  $(PIP) install -qq $(TORCH_ARGS) "$(TORCH_RANGE)"; }
 	@echo "[install 3/4] wpt-agents and what it needs (simulators, Stable-Baselines3, tools)"
-	@$(PIP) install -qq -e ".[dev]"
+	@$(PIP) install -qq -e ".[all,dev]"
 	@echo "[install 4/4] a check that the parts fit together"
 	@$(PIP) check || echo "              pip names a conflict above; going on"
 	@$(BIN)/python -c "import torch, mujoco, stable_baselines3 as sb3; print('              torch', torch.__version__ + ', mujoco', mujoco.__version__ + ', stable-baselines3', sb3.__version__)"

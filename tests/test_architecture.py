@@ -95,18 +95,30 @@ def test_the_reader_of_imports_sees_lazy_and_relative_ones(tmp_path):
     assert {"wpt_agents.agents.wpt", "wpt_agents.zoo"} <= found
 
 
-def test_every_third_party_import_is_declared():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = {re.split("[<>=]", d)[0].replace("-", "_") for d in project["dependencies"]}
-    declared |= {
-        "faiss",
-        "yaml",
-        "PIL",
-        "mujoco",
-        "lxml",
-        "dm_env",
-        "glfw",
-    }  # other names; simulators'
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+NAMES = {"faiss_cpu": "faiss", "pyyaml": "yaml", "pillow": "PIL"}  # what packages are imported as
+SIMULATORS = {"mujoco", "lxml", "dm_env", "glfw"}  # what comes with them
+
+
+def declared(*extras):
+    """The import names of what the package and these extras install."""
+    lines = [*PYPROJECT["dependencies"]]
+    for extra in extras:
+        lines += PYPROJECT["optional-dependencies"][extra]
+    found = {re.split("[<>=;\\[ ]", line)[0].replace("-", "_") for line in lines}
+    return {NAMES.get(name, name) for name in found} | (SIMULATORS if "sims" in extras else set())
+
+
+@pytest.mark.parametrize(
+    ("package", "part", "extras"),
+    [
+        ("wpt_agents", lambda name: not name.startswith("wpt_agents.zoo"), ()),
+        ("wpt_agents", lambda name: name.startswith("wpt_agents.zoo"), ("zoo", "sims")),
+        ("wpt_envs", lambda name: True, ("sims",)),
+    ],
+    ids=["agents", "zoo", "tasks"],
+)
+def test_every_third_party_import_is_declared_where_it_is_needed(package, part, extras):
     inside = {"wpt_agents", "wpt_envs", ""} | set(sys.stdlib_module_names)
-    every = [i for p in ("wpt_agents", "wpt_envs") for m in modules(p) for i in imports(*m)]
-    assert {i.split(".")[0] for i in every} - inside <= declared
+    every = {i.split(".")[0] for n, p in modules(package) if part(n) for i in imports(n, p)}
+    assert every - inside <= declared(*extras)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from wpt_agents.agents.wpt import WPT
     from wpt_agents.data.dataset import TrajectoryDataset
     from wpt_agents.data.trajectory import Trajectory
+    from wpt_agents.zoo.collect.collection import collect
 
 PUBLIC = {
     "WPT": "wpt_agents.agents.wpt",
@@ -27,8 +28,12 @@ PUBLIC = {
     "PackNet": "wpt_agents.agents.packnet",
     "R3M": "wpt_agents.agents.r3m",
     "RLPD": "wpt_agents.agents.rlpd",
+    "collect": "wpt_agents.zoo.collect.collection",
 }
-__all__ = ["JSRL", "R3M", "RLPD", "WPT", "DrQv2", "PackNet", "Trajectory", "TrajectoryDataset"]
+__all__ = [
+    *("JSRL", "R3M", "RLPD", "WPT", "DrQv2", "PackNet", "Trajectory", "TrajectoryDataset"),
+    "collect",
+]
 __version__ = "0.1.0"
 
 

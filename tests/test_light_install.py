@@ -1,8 +1,8 @@
 """What `pip install wpt-agents` alone brings is enough to pre-train and to act."""
 
+import resource
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 
@@ -87,15 +87,16 @@ def seconds(*words):
     """The processor seconds of a Python process, the least of three."""
     took = []
     for _ in range(3):
-        before = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         python("", *words)
-        took.append(time.perf_counter() - before)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     return min(took)
 
 
 def test_the_help_takes_little_longer_than_typer_itself():
-    """Measured as a ratio, since machines differ; `--help` draws its text, too."""
-    assert seconds("-m", "wpt_agents.zoo", "--help") < 2.5 * seconds("-c", "import typer.testing")
+    """As a ratio, since machines differ. Rich, which draws the help, is two thirds of the rest."""
+    assert seconds("-m", "wpt_agents.zoo", "--help") < 5 * seconds("-c", "import typer")
 
 
 def test_everything_that_a_makefile_or_a_test_installs_is_in_an_extra():

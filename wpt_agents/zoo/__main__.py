@@ -1,6 +1,11 @@
-"""`python -m wpt_agents.zoo`; the commands stand in `wpt_agents.zoo.commands`."""
+"""`python -m wpt_agents.zoo`; the commands are in `wpt_agents.zoo.commands`."""
 
-from wpt_agents.zoo.commands.app import main
+import sys
 
 if __name__ == "__main__":
+    try:
+        from wpt_agents.zoo.commands.app import main
+    except ModuleNotFoundError as error:
+        print(f'{error.name} is not installed: pip install "wpt-agents[all]"', file=sys.stderr)
+        sys.exit(2)
     main()

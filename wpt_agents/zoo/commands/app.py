@@ -1,9 +1,11 @@
 """The command line of the zoo: every command under its name, and how errors end.
 
-Imports stand inside the commands so that `--help` answers at once.
+Imports are inside the commands so that `--help` answers at once.
 """
 
 import sys
+import traceback
+from typing import Annotated
 
 import typer
 
@@ -12,15 +14,47 @@ from wpt_agents.zoo.commands.bench import bench
 from wpt_agents.zoo.commands.options import Spaced
 from wpt_agents.zoo.commands.report import report
 
+HELP = """\
+Collect data, pre-train world models, fine-tune them on tasks, compare the results.
+
+Start with `python -m wpt_agents.zoo list`, then
+`python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo`.
+"""
+FIRST_STEPS = """\
+Three commands to start with:
+
+  python -m wpt_agents.zoo list --suite metaworld
+      shows the tasks, the presets and the methods
+
+  python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo
+      collects data, pre-trains a world model, fine-tunes it and films the result, in minutes
+
+  python -m wpt_agents.zoo report runs
+      writes a page about all runs
+
+All commands: python -m wpt_agents.zoo --help. About one: python -m wpt_agents.zoo run --help.
+"""
+DEBUG = "--debug"
+
 app = typer.Typer(
     add_completion=False,
-    no_args_is_help=True,
+    invoke_without_command=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    help="Collect data, pre-train world models, fine-tune them on tasks, compare the results.\n\n"
-    "Start with `python -m wpt_agents.zoo list`, then "
-    "`python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo`.",
+    help=HELP,
 )
+
+
+@app.callback()
+def start(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option(DEBUG, help="Show the traceback of an error.")] = False,
+) -> None:
+    """Show the first steps if there is no command."""
+    if context.invoked_subcommand is None:
+        typer.echo(FIRST_STEPS, nl=False)
+
+
 data.register(app)
 app.command("import-model")(models.import_model)
 app.command("list")(runs.list_tasks)
@@ -34,15 +68,33 @@ app.command("push")(trained.push_run)
 app.command("pull")(trained.pull_run)
 app.command("report")(report)
 app.command("bench")(bench)
+start.__doc__ = HELP  # what `--help` shows
 
 
 def main() -> None:
-    """Run a command; a user's mistake ends in one line and exit code 2."""
+    """Run a command; every error ends in one sentence, and shows its traceback with `--debug`.
+
+    The exit code is 2 for mistakes that the user can mend, 1 for ours, and 130 for an interruption.
+    """
+    words = [word for word in sys.argv[1:] if word != DEBUG]
     try:
-        app()
-    except (ValueError, FileNotFoundError) as error:
-        typer.secho(f"Error: {error}", fg="red", err=True)
-        sys.exit(2)
+        app(words)
     except KeyboardInterrupt:
-        typer.echo("Interrupted. The same command goes on from the finished stages.", err=True)
+        typer.echo("Interrupted. The same command continues from the finished stages.", err=True)
         sys.exit(130)
+    except Exception as error:
+        if len(words) < len(sys.argv) - 1:
+            traceback.print_exc()
+        message, code = explain(error)
+        typer.secho(f"Error: {message}", fg="red", err=True)
+        sys.exit(code)
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return the sentence that describes an error, and the exit code."""
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("wpt_"):
+        return f'{error.name} is not installed: pip install "wpt-agents[all]"', 2
+    if isinstance(error, (ValueError, OSError)):
+        return str(error), 2
+    kind = type(error).__name__
+    return f"{kind}: {error} (add {DEBUG} to see where, and please report it)", 1

@@ -1,6 +1,6 @@
-"""The command `bench`: what is measured, and how it is shown.
+"""The command `bench`: which case is measured, and how its rows are shown.
 
-Each case is a module beside this one with `rows(quick) -> Iterator[dict]`, imported when asked for.
+Each case is a module of `wpt_agents.zoo.bench` with a function `rows(quick)`, imported when needed.
 """
 
 import importlib
@@ -26,23 +26,35 @@ Precision = StrEnum("Precision", ["fp32", "bf16"])
 
 def bench(
     case: Annotated[Case, typer.Argument(help="What to measure.")] = Case.all,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
-    quick: Annotated[bool, typer.Option(help="Seconds: does it run? The numbers mean little.")] = (
-        False
-    ),
-    threads: Annotated[int, typer.Option(min=1, help="Of torch; several take turns with one.")] = 1,
-    precision: Annotated[Precision, typer.Option(help="Of the forward passes.")] = Precision.fp32,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object per line.")
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option(help="Only check that it runs, in seconds; the numbers mean little.")
+    ] = (False),
+    threads: Annotated[
+        int,
+        typer.Option(min=1, help="Threads of torch; several threads take turns with a single one."),
+    ] = 1,
+    precision: Annotated[
+        Precision, typer.Option(help="The precision of the forward passes.")
+    ] = Precision.fp32,
     compiled: Annotated[
-        bool, typer.Option("--compile", help="Of model: scan and dream by torch.compile; minutes.")
+        bool,
+        typer.Option(
+            "--compile",
+            help="For model: compile scan and imagination by torch.compile, which takes minutes.",
+        ),
     ] = False,
     peer: Annotated[
-        Peer | None, typer.Option(help="Of model: this library's DreamerV3 beside ours instead.")
+        Peer | None,
+        typer.Option(help="For model: measure this library's DreamerV3 beside ours instead."),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Of scaling: draw what was measured into this file.")
+        Path | None, typer.Option(help="For scaling: draw the measurements into this file.")
     ] = None,
     updates: Annotated[
-        int | None, typer.Option(min=1, help="Of each model, in the case prediction.")
+        int | None, typer.Option(min=1, help="For prediction: the updates of each model.")
     ] = None,
     probe: Annotated[
         bool,
@@ -53,11 +65,11 @@ def bench(
         ),
     ] = False,
 ) -> None:
-    """Measures speed on this machine: medians after a warm-up.
+    """Measure speed on this machine: medians after a warm-up.
 
-    On one thread of a CPU of processor time, else of wall-clock.
+    Times are processor time on one thread of a CPU, and wall-clock time otherwise.
 
-    `share_of_ceiling` compares with a large matmul in the same run; work is counted, not guessed.
+    `share_of_ceiling` compares with a large matrix product in the same run; the work is counted.
 
     Example: `python -m wpt_agents.zoo bench model --json > model.jsonl`
     """
@@ -86,12 +98,14 @@ def bench(
                 module.plot(found, plot)
         except ImportError as error:
             if case != Case.all:
-                raise ValueError(f"bench {name} needs {error.name}, which is not here.") from error
-            typer.echo(f"bench {name} left out: it needs {error.name}.", err=True)
+                raise ValueError(
+                    f"bench {name} needs {error.name}, which is not installed"
+                ) from error
+            typer.echo(f"bench {name} is left out: it needs {error.name}.", err=True)
 
 
 def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
-    """What a case yields, given the options that it takes, and the memory that each row took."""
+    """Yield the rows of a case, each with the memory that it took; pass the options it takes."""
     from wpt_agents.zoo.bench.timing import forget_peak, peak_rss_mb
 
     taken = inspect.signature(module.rows).parameters
@@ -103,7 +117,7 @@ def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
 
 
 def _show(name: str, rows: Iterator[dict], as_json: bool) -> list[dict]:
-    """Prints the rows, as JSON each as soon as it is measured; returns them."""
+    """Print the rows, as JSON as soon as each one is measured, and return them."""
     found = []
     for row in rows:
         found.append(row)

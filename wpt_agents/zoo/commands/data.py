@@ -1,6 +1,6 @@
-"""The commands that make data and look at them: collect, import, data ..., retrieve show.
+"""The commands that make and show data: collect, import, data ..., retrieve show.
 
-Imports stand inside the commands so that `--help` answers at once.
+Imports are inside the commands so that `--help` answers at once.
 """
 
 import warnings
@@ -14,14 +14,14 @@ from wpt_agents.zoo.commands.options import Rendering, Spaced, Suite, Tasks, Wor
 if TYPE_CHECKING:
     from wpt_agents.data.dataset import TrajectoryDataset
 
-data = typer.Typer(no_args_is_help=True, help="Looks at datasets, checks and joins them.")
-retrieve = typer.Typer(no_args_is_help=True, help="Looks at what retrieval finds.")
-Store = Annotated[Path, typer.Argument(help="A dataset's folder.")]
-Picture = Annotated[Path, typer.Option(help="Where the picture goes.")]
+data = typer.Typer(no_args_is_help=True, help="Show, check and join datasets.")
+retrieve = typer.Typer(no_args_is_help=True, help="Show what retrieval finds.")
+Store = Annotated[Path, typer.Argument(help="The folder of a dataset.")]
+Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands to the zoo's."""
+    """Add the commands to the zoo's."""
     app.command("collect", cls=Spaced)(collect_data)
     app.command("import")(import_data)
     data.command("show")(show_data)
@@ -33,26 +33,35 @@ def register(app: typer.Typer) -> None:
 
 
 def collect_data(
-    out: Annotated[Path, typer.Option(help="The dataset's folder; half of one is continued.")],
+    out: Annotated[
+        Path, typer.Option(help="The folder of the dataset; an unfinished one is continued.")
+    ],
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006  # typer wants a list
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Of each task. None: as many as the paper's.")
+        int | None,
+        typer.Option(min=1, help="Episodes of each task, as many as the paper's by default."),
     ] = None,
     seed: int = 0,
     workers: Workers = 2,
     behaviour: Annotated[
         str,
         typer.Option(
-            help="What plays: noise, random, scripted (Meta-World), policy, explore-state, icm or "
+            help="How to act: noise, random, scripted (Meta-World), policy, explore-state, icm or "
             "plan2explore. By default scripted in metaworld and noise elsewhere."
         ),
     ] = "",
     sigma: Annotated[
-        list[float], typer.Option(help="Noise on scripted and saved policies, in turn by episode.")
+        list[float],
+        typer.Option(
+            help="Standard deviations of the noise on scripted and saved policies, in turn."
+        ),
     ] = [0.1, 0.3, 0.5, 1.0, 2.0],  # noqa: B006
     policy: Annotated[
-        str | None, typer.Option(help="For policy: a WPT model file, or SB3's as `sac:FILE`.")
+        str | None,
+        typer.Option(
+            help="The model for the behaviour policy: a file of WPT, or of SB3 as `sac:FILE`."
+        ),
     ] = None,
     rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
     settings: Annotated[
@@ -63,12 +72,14 @@ def collect_data(
             help="Keywords of WPT for icm and plan2explore; steps=N for explore-state.",
         ),
     ] = [],  # noqa: B006
-    rendering: Annotated[Rendering, typer.Option(help="Of the pictures.")] = Rendering.near,
+    rendering: Annotated[
+        Rendering, typer.Option(help="The quality of the images.")
+    ] = Rendering.near,
 ) -> None:
-    """Plays tasks and stores the episodes, without rewards unless asked for.
+    """Play tasks and store the episodes, without rewards by default.
 
-    By default as the paper: in metaworld 50 tasks x 5 strengths of noise x 200 episodes of scripted
-    policies, in dmc 2000 episodes of each of 5 robots.
+    The defaults are the paper's: in metaworld 200 episodes of scripted policies for each of 50
+    tasks and 5 strengths of noise, in dmc 2000 episodes of each of 5 robots.
 
     Example: `python -m wpt_agents.zoo collect --tasks walker-run --behaviour icm --out data`
     """
@@ -102,28 +113,47 @@ def import_data(
         ),
     ],
     source: Annotated[
-        str, typer.Argument(metavar="SRC", help="A folder, a file, or a Minari dataset's name.")
+        str,
+        typer.Argument(metavar="SRC", help="A folder, a file, or the name of a Minari dataset."),
     ],
     out: Annotated[
-        Path, typer.Argument(metavar="DST", help="The dataset's folder; half of one is continued.")
+        Path,
+        typer.Argument(
+            metavar="DST", help="The folder of the dataset; an unfinished one is continued."
+        ),
     ],
-    embodiment: Annotated[str | None, typer.Option(help="The robot's name, for all.")] = None,
-    task: Annotated[str | None, typer.Option(help="What the behaviour was after, for all.")] = None,
-    rewards: Annotated[bool, typer.Option("--rewards", help="Keep the rewards.")] = False,
-    image_size: Annotated[int, typer.Option(min=1, help="Resize to this; WPT takes 64.")] = 64,
-    image_key: Annotated[str | None, typer.Option(help="Where the images are.")] = None,
-    action_key: Annotated[str | None, typer.Option(help="rlds: where the actions are.")] = None,
-    camera: Annotated[str | None, typer.Option(help="lerobot: which, if several.")] = None,
-    split: Annotated[str | None, typer.Option(help="rlds: only this one, e.g. train.")] = None,
-    low: Annotated[
-        str | None, typer.Option(help="All but sb3: the actions' limits, `--low=-2,-2`.")
+    embodiment: Annotated[
+        str | None, typer.Option(help="The name of the robot, for all episodes.")
     ] = None,
-    high: Annotated[str | None, typer.Option(help="`--high=2,2`.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="The name of the task, for all episodes.")
+    ] = None,
+    rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
+    image_size: Annotated[
+        int, typer.Option(min=1, help="The width that images are resized to; WPT takes 64.")
+    ] = 64,
+    image_key: Annotated[str | None, typer.Option(help="The key of the images.")] = None,
+    action_key: Annotated[
+        str | None, typer.Option(help="The key of the actions, for rlds.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="The camera, for lerobot data with several.")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="The only split to import, for rlds, e.g. train.")
+    ] = None,
+    low: Annotated[
+        str | None,
+        typer.Option(help="The lower limits of the actions, e.g. `--low=-2,-2`; not for sb3."),
+    ] = None,
+    high: Annotated[
+        str | None, typer.Option(help="The upper limits of the actions, e.g. `--high=2,2`.")
+    ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="sb3: load a pickle, which may run any code.")
+        bool, typer.Option("--trust", help="Load a pickle, for sb3, which may run any code.")
     ] = False,
 ) -> None:
-    """Converts other people's data into a dataset, episode by episode; repeat it to go on.
+    """Convert other people's data into a dataset; the same command continues an unfinished one.
 
     Example: `python -m wpt_agents.zoo import npz exorl/walker data/walker --embodiment walker`
     """
@@ -155,7 +185,7 @@ def _numbers(option: str, text: str | None) -> list[float] | None:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"{option} wants numbers with commas between, got {text!r}") from None
+        raise ValueError(f"{option} takes numbers separated by commas, got {text!r}") from None
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
@@ -163,7 +193,7 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _print_summary(dataset: "TrajectoryDataset") -> None:
-    """What the dataset holds, robot by robot, and where it is."""
+    """Print what the dataset contains for each robot, and where it is."""
     from wpt_agents.zoo.pictures.datasets import data_table
     from wpt_agents.zoo.terminal import console
 
@@ -174,9 +204,11 @@ def _print_summary(dataset: "TrajectoryDataset") -> None:
 def show_data(
     folder: Store,
     out: Picture = Path("contact-sheet.png"),
-    rows: Annotated[int, typer.Option(min=1, help="Trajectories on the picture.")] = 12,
+    rows: Annotated[
+        int, typer.Option(min=1, help="The number of trajectories in the picture.")
+    ] = 12,
 ) -> None:
-    """Prints what a dataset holds, robot by robot, and draws some of its trajectories.
+    """Print what a dataset contains for each robot, and draw some of its trajectories.
 
     Example: `python -m wpt_agents.zoo data show data/two --out two.png`
     """
@@ -193,12 +225,12 @@ def show_data(
 def validate_data(
     folder: Store,
     set_aside: Annotated[
-        bool, typer.Option("--set-aside", help="Leave the damaged ones out from now on.")
+        bool, typer.Option("--set-aside", help="Exclude damaged trajectories from now on.")
     ] = False,
 ) -> None:
-    """Reads every byte of a dataset and names the trajectories that are damaged.
+    """Read every byte of a dataset and name the damaged trajectories.
 
-    Exits with 1 if there are any, unless they are set aside.
+    The exit code is 1 if there are any and they are not set aside.
 
     Example: `python -m wpt_agents.zoo data validate data/two`
     """
@@ -216,10 +248,12 @@ def validate_data(
 
 
 def merge_data(
-    out: Annotated[Path, typer.Argument(metavar="DST", help="The new dataset's folder.")],
-    folders: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Datasets to join.")],
+    out: Annotated[Path, typer.Argument(metavar="DST", help="The folder of the new dataset.")],
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="SRC...", help="The folders of the datasets to join.")
+    ],
 ) -> None:
-    """Makes a new dataset of all trajectories of others, in their order.
+    """Make a new dataset of all trajectories of other datasets, in their order.
 
     Example: `python -m wpt_agents.zoo data merge data/all data/noise data/curious`
     """
@@ -230,25 +264,32 @@ def merge_data(
 
 def show_retrieval(
     folder: Store,
-    model: Annotated[Path, typer.Option(help="The model file whose encoder compares.")],
+    model: Annotated[Path, typer.Option(help="The model file whose encoder compares the images.")],
     query: Annotated[
-        list[int], typer.Option(help="Trajectories of the dataset to search for, by number.")
+        list[int], typer.Option(help="Numbers of trajectories of the dataset to search for.")
     ] = [],  # noqa: B006
     task: Annotated[
         list[str],
         typer.Option(help="Tasks whose first image to search for."),
     ] = [],  # noqa: B006
     suite: Suite = "dmc",
-    rendering: Annotated[Rendering, typer.Option(help="Of --task.")] = Rendering.near,
-    number: Annotated[int, typer.Option(min=1, help="How many of the nearest.")] = 8,
+    rendering: Annotated[
+        Rendering, typer.Option(help="The quality of the images of --task.")
+    ] = Rendering.near,
+    number: Annotated[
+        int, typer.Option(min=1, help="The number of nearest trajectories to show.")
+    ] = 8,
     own_robot: Annotated[
-        bool, typer.Option("--own-robot", help="Only its robot and action width, as WPT does.")
+        bool,
+        typer.Option(
+            "--own-robot", help="Search only the query's robot and number of actions, as WPT does."
+        ),
     ] = False,
     out: Picture = Path("retrieval.png"),
 ) -> None:
-    """Draws first images beside the trajectories that begin most like them, with distances.
+    """Draw first images beside the trajectories with the most similar ones, with distances.
 
-    Without --query and --task, some trajectories of the dataset are searched for.
+    Without --query and --task, the queries are some trajectories of the dataset.
 
     Example: `python -m wpt_agents.zoo retrieve show data/two --model m.zip --task walker-run`
     """

@@ -21,7 +21,7 @@ def import_model(
         typer.Option(help="The number of groups of z, if it is not the authors' 32."),
     ] = None,
 ) -> None:
-    """Converts a model file in another format into one of ours, which every command takes.
+    """Convert a model file in another format into one of ours, which every command takes.
 
     Example: `python -m wpt_agents.zoo import-model official dmcontrol.pt dmcontrol.zip`
 

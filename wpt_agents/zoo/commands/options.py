@@ -1,4 +1,4 @@
-"""What several commands share: options, and how they take several values."""
+"""What several commands share: options, and options that take several values."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -12,54 +12,63 @@ class Spaced(TyperCommand):
     """Lets an option take several values at once: `--tasks a b` for `--tasks a --tasks b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Repeats the option's name before each further value."""
+        """Repeat the option's name before each further value."""
         several = {o for p in self.params if p.multiple for o in p.opts}
-        spread: list[str] = []
-        option, given = None, False
+        words: list[str] = []
+        option = None  # that takes several values, if the last one does
+        has_value = False
         for arg in args:
             if arg.startswith("-"):
-                option, given = (arg if arg in several else None), False
-            elif option and given:
-                spread.append(option)
+                option = arg if arg in several else None
+                has_value = False
+            elif option and has_value:
+                words.append(option)
             else:
-                given = True
-            spread.append(arg)
-        return super().parse_args(ctx, spread)
+                has_value = True
+            words.append(arg)
+        return super().parse_args(ctx, words)
 
 
 Rendering = StrEnum("Rendering", ["exact", "near", "fast"])
-Suite = Annotated[str, typer.Option(help="dmc, or another suite of `list`.")]
+Suite = Annotated[
+    str, typer.Option(help="The suite of tasks: dmc, or another one that `list` shows.")
+]
 Tasks = Annotated[
     list[str],
-    typer.Option(help="Names or patterns, e.g. `walker-run 'cheetah-*'`. None: the paper's."),
+    typer.Option(
+        help="Names of tasks or patterns, e.g. `walker-run 'cheetah-*'`; the paper's by default."
+    ),
 ]
 Settings = Annotated[
     list[str],
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Changes the preset: a keyword of WPT (`gamma=0.98`), or `section.key=value` "
+        help="A change of the preset: a keyword of WPT (`gamma=0.98`), or `section.key=value` "
         "(`pretrain.steps=500`, `env.rendering=near`).",
     ),
 ]
 Workers = Annotated[
     int,
-    typer.Option(min=1, help="Processes that collect data; runs at a time of `--engine local`."),
+    typer.Option(
+        min=1,
+        help="Processes that collect data, and simultaneous runs of `--engine local`.",
+    ),
 ]
 
 
-def print_table(title: str, found: Sequence[Mapping[str, Any]]) -> None:
-    """Prints rows of several columns each; what a row lacks stays empty."""
+def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows of named cells; cells that a row lacks stay empty."""
     from rich.table import Table
 
     from wpt_agents.zoo.terminal import console
 
-    columns = list(dict.fromkeys(key for row in found for key in row))
+    columns = list(dict.fromkeys(key for row in rows for key in row))
     table = Table(title=title)
     for name in columns:
-        widest = max(map(len, name.split()))  # of its words, not to be broken where there is room
+        widest = max(map(len, name.split()))  # words are broken only where there is no room
         table.add_column(name, overflow="fold", min_width=min(widest, 12))
-    for row in found:
+    for row in rows:
         table.add_row(*(_cell(row.get(key, "")) for key in columns))
     console.print(table)
 
@@ -68,4 +77,6 @@ def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
+Device = Annotated[
+    str, typer.Option(help="The device of the networks: auto, cpu, cuda, cuda:1, ...")
+]

@@ -1,4 +1,4 @@
-"""The command `report`. Imports stand inside it so that `--help` answers at once."""
+"""The command `report`. Imports are inside it so that `--help` answers at once."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,29 +7,38 @@ import typer
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Run folders are searched below it.")] = Path(
-        "runs"
-    ),
+    folder: Annotated[
+        Path, typer.Argument(help="The folder below which run folders are searched.")
+    ] = Path("runs"),
     markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
-    csv: Annotated[bool, typer.Option(help="Print every policy as CSV instead.")] = False,
+    csv: Annotated[
+        bool, typer.Option(help="Print a line for every policy, as CSV, instead.")
+    ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="The page's folder. None: `report` in FOLDER.")
+        Path | None, typer.Option(help="The folder of the page, `report` in FOLDER by default.")
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(help="A CSV to keep a line of every policy and run in; what it holds stays."),
+        typer.Option(
+            help="A CSV that keeps a line for every policy and run; lines of other runs stay."
+        ),
     ] = None,
     media: Annotated[
-        str, typer.Option(help="Videos and pictures: first (of each task), all or none.")
+        str,
+        typer.Option(
+            help="Which runs show videos and pictures: first (of each task), all or none."
+        ),
     ] = "first",
 ) -> None:
-    """Shows the mean over seeds of every task and method, and writes a page about all runs.
+    """Show the mean over seeds of every task and method, and write a page about all runs.
 
     The page is one file that needs no network: the paper's tables beside yours, aggregates with
-    intervals, learning curves, videos, the command behind each number, and what failed. Beside it
-    stand the same numbers as Markdown and CSV, which also have every policy: doing nothing, random,
-    prior actor, WPT. A record (--record results.csv) is small enough to keep when the run folders
-    are gone; results.md and results.png beside it show it.
+    intervals, learning curves, videos, the command behind each number, and what failed. The same
+    numbers are beside it as Markdown and CSV, for every policy: doing nothing, random, prior actor
+    and the agent. A record (--record results.csv) is small enough to outlive the run folders;
+    results.md and results.png beside it show it.
+
+    Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_tables, tables
@@ -38,7 +47,9 @@ def report(
     from wpt_agents.zoo.terminal import console
 
     if record is not None and record.suffix != ".csv":
-        raise ValueError(f"--record {record}: a record is a .csv; its .md and .png stand beside it")
+        raise ValueError(
+            f"--record {record}: a record is a .csv; its .md and .png are written beside it"
+        )
     results = read_results(folder)
     if not results:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")

@@ -8,39 +8,84 @@ import typer
 from wpt_agents.zoo.commands.options import Device, Settings, Suite, Tasks, Workers
 
 PresetName = Annotated[
-    str, typer.Option(help="How large: debug, demo, tiny, small, medium, paper (Table 2).")
+    str,
+    typer.Option(help="How large the run is: debug, demo, tiny, mid, small, medium, paper, ..."),
 ]
-
-
-Out = Annotated[Path, typer.Option(help="Where the run folders and the shared stages go.")]
-
-
+Out = Annotated[Path, typer.Option(help="The folder of the run folders and the shared stages.")]
 Data = Annotated[
-    Path | None, typer.Option(help="A dataset of your own. None: the preset's, collected.")
+    Path | None, typer.Option(help="Your own dataset, in place of the preset's collected data.")
+]
+Seeds = Annotated[
+    str, typer.Option(help="How many seeds (`3` is 0, 1 and 2), which (`0,5`), or a range (`0-2`).")
+]
+MethodNames = Annotated[
+    list[str],
+    typer.Option(
+        help="One or more methods that `list` shows. Fig. 5 of the paper is `scratch "
+        "pretrain-only no-guidance wpt`."
+    ),
+]
+Frames = Annotated[
+    int | None, typer.Option(help="Simulator frames of fine-tuning (`learn.frames`).")
+]
+Force = Annotated[bool, typer.Option(help="Replace finished runs.")]
+DryRun = Annotated[bool, typer.Option(help="Show the plan and do nothing.")]
+Watch = Annotated[
+    bool, typer.Option(help="Only show the progress of these runs, made by another terminal.")
+]
+Engine = Annotated[
+    str,
+    typer.Option(
+        help="Where runs are done. none: here, one after the other; local: each in its own "
+        "process, `--workers` at a time; ray: on a cluster; slurm: as jobs of submitit."
+    ),
+]
+Cpus = Annotated[int, typer.Option(min=1, help="CPU cores to reserve for each run of an engine.")]
+Gpus = Annotated[
+    float, typer.Option(min=0, help="GPUs to reserve for each run of an engine; 0.5 with Ray.")
+]
+Memory = Annotated[
+    float, typer.Option(min=0, help="GB of memory to reserve for each run on Ray and Slurm.")
+]
+Hours = Annotated[
+    float, typer.Option(help="The time limit of a Slurm job; unfinished runs are sent again.")
+]
+Retries = Annotated[
+    int, typer.Option(min=0, help="How often a run is begun again when its worker dies.")
+]
+Address = Annotated[
+    str, typer.Option(help="The address of the Ray cluster; by default one is started here.")
+]
+Partition = Annotated[
+    str, typer.Option(help="The partition of Slurm; `local` works without Slurm.")
 ]
 
 
 def list_tasks(
-    suite: Annotated[str, typer.Option(help="Only this suite.")] = "",
+    suite: Annotated[str, typer.Option(help="The only suite to show.")] = "",
 ) -> None:
-    """Shows the tasks of each suite, and the presets and methods that `run` knows."""
+    """Show the tasks of each suite, and the presets and methods that `run` knows.
+
+    Example: `python -m wpt_agents.zoo list --suite metaworld`
+    """
     from rich.table import Table
     from wpt_envs.tasks import TASKS
 
     from wpt_agents.files.names import unknown_name
     from wpt_agents.zoo.plan.methods import METHODS
     from wpt_agents.zoo.plan.presets import preset_names, suite_names
+    from wpt_agents.zoo.tasks import short_name
     from wpt_agents.zoo.terminal import console
 
     suites = list(dict.fromkeys(row.suite for row in TASKS.values()))
     if suite and suite not in suites:
         raise unknown_name("suite", suite, suites)
-    table = Table("task", "embodiment", "actions", "frames an episode", "metric", "in the paper")
+    table = Table("task", "embodiment", "actions", "frames per episode", "metric", "in the paper")
     for row in TASKS.values():
         if suite in ("", row.suite):
             numbers = str(row.action_dim), str(row.frames)
             paper = "yes" if row.in_paper else "no"
-            table.add_row(f"{row.suite}-{row.name}", row.embodiment, *numbers, row.metric, paper)
+            table.add_row(short_name(row), row.embodiment, *numbers, row.metric, paper)
     console.print(table)
     for name in suite_names():
         console.print(f"presets of {name}: {', '.join(preset_names(name))}")
@@ -56,10 +101,10 @@ def pretrain_model(
     workers: Workers = 2,
     device: Device = "auto",
     accumulate: Annotated[
-        int, typer.Option(min=1, help="Passes over each batch, to save memory.")
+        int, typer.Option(min=1, help="Passes over each batch; more passes save memory.")
     ] = 1,
 ) -> None:
-    """Pre-trains a preset's world model, on its data or yours; `run` reuses it.
+    """Pre-train the world model of a preset, on its data or yours; `run` reuses it.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
 
@@ -88,81 +133,49 @@ def run_benchmark(
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006
     preset: PresetName = "demo",
-    seeds: Annotated[
-        str, typer.Option(help="How many (`3` is 0, 1 and 2), which (`0,5`) or from-to (`0-2`).")
-    ] = "1",
-    method: Annotated[
-        list[str],
-        typer.Option(
-            help="wpt, kickstart, scratch, pretrain-only, no-guidance, no-rehearsal, no-pretrain, "
-            "random-retrieval; several allowed. Fig. 5 is `scratch pretrain-only no-guidance wpt`."
-        ),
-    ] = ["wpt"],  # noqa: B006
-    frames: Annotated[
-        int | None, typer.Option(help="Simulator frames of fine-tuning (learn.frames).")
-    ] = None,
+    seeds: Seeds = "1",
+    method: MethodNames = ["wpt"],  # noqa: B006
+    frames: Frames = None,
     settings: Settings = [],  # noqa: B006
     data: Data = None,
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
-    force: Annotated[bool, typer.Option(help="Start finished runs anew.")] = False,
-    dry_run: Annotated[bool, typer.Option(help="Show the plan and do nothing.")] = False,
-    watch: Annotated[
-        bool, typer.Option(help="Only show where these runs stand, made by another terminal.")
-    ] = False,
-    engine: Annotated[
-        str,
-        typer.Option(
-            help="none: one run after the other, here; local: each in a process of its own, "
-            "`--workers` at a time; ray: on a cluster; slurm: as jobs of submitit."
-        ),
-    ] = "none",
-    cpus: Annotated[int, typer.Option(min=1, help="Of each run, on an engine.")] = 1,
-    gpus: Annotated[float, typer.Option(min=0, help="Of each run; may be 0.5 with Ray.")] = 0,
-    memory_gb: Annotated[float, typer.Option(min=0, help="Of each run, on Ray and Slurm.")] = 4,
-    hours: Annotated[float, typer.Option(help="Slurm's limit; the run is sent again.")] = 24,
-    retries: Annotated[int, typer.Option(min=0, help="After a worker's death.")] = 2,
-    address: Annotated[str, typer.Option(help="Of the Ray cluster. None: one here.")] = "",
-    partition: Annotated[str, typer.Option(help="Slurm's; `local` does without Slurm.")] = "",
+    force: Force = False,
+    dry_run: DryRun = False,
+    watch: Watch = False,
+    engine: Engine = "none",
+    cpus: Cpus = 1,
+    gpus: Gpus = 0,
+    memory_gb: Memory = 4,
+    hours: Hours = 24,
+    retries: Retries = 2,
+    address: Address = "",
+    partition: Partition = "",
 ) -> None:
-    """Runs the whole method: collect, pre-train, index, fine-tune, evaluate.
+    """Do the whole method: collect, pre-train, index, fine-tune, evaluate.
 
     Each task, method and seed gets a run folder with its configuration, logs, model, learning
-    curve, video and `result.json`. What is finished is not done again.
+    curve, video and `result.json`. Finished stages are reused.
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
     """
     from wpt_agents.training.distributed import started_by_torchrun
-    from wpt_agents.zoo.machine import check_machine
-    from wpt_agents.zoo.plan.estimate import check_space, summary
-    from wpt_agents.zoo.plan.overview import show_plan
     from wpt_agents.zoo.plan.runs import make_plan
-    from wpt_agents.zoo.run.engines import Resources, run_on
-    from wpt_agents.zoo.run.folder import check_folder
-    from wpt_agents.zoo.run.runner import run_all
+    from wpt_agents.zoo.run.dispatch import do_plan, preview
+    from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
 
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
-    jobs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
+    runs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if watch:
-        show_standings(jobs)
+        show_standings(runs)
         return
     if dry_run:
-        show_plan(jobs, force)
-        typer.echo(summary(jobs, force))
-    check_machine(engine, device)
-    check_space(jobs)
-    for job in jobs:
-        check_folder(job, force)
-    if dry_run:
+        preview(runs, engine, force)
         return
-    if engine == "none":
-        done = run_all(jobs, force)
-    else:
-        limits = cpus, gpus, memory_gb, hours, retries
-        done = run_on(engine, jobs, force, Resources(workers, *limits, address, partition))
-    if not done:
+    limits = cpus, gpus, memory_gb, hours, retries
+    if not do_plan(runs, engine, force, Resources(workers, *limits, address, partition)):
         raise typer.Exit(1)

@@ -8,27 +8,38 @@ import typer
 from wpt_agents.zoo.commands.options import Device, print_table
 
 RunFolder = Annotated[
-    Path, typer.Argument(help="A run folder, moved or pulled too, or a model file (.zip).")
+    Path,
+    typer.Argument(
+        help="A run folder, which may have been moved or pulled, or a model file (.zip)."
+    ),
 ]
 
 
 ForTask = Annotated[
-    str, typer.Option(help="`dmc-walker-run`; only for a model file without its run folder.")
+    str,
+    typer.Option(
+        help="The task, e.g. `dmc-walker-run`; needed for a model file without its run folder."
+    ),
 ]
 
 
-Policy = Annotated[str, typer.Option(help="wpt, or prior: the actor that guided it.")]
+Policy = Annotated[
+    str,
+    typer.Option(
+        help="The policy to play: wpt, the trained agent, or prior, the clone that guided it."
+    ),
+]
 
 
 def evaluate_model(
     run: RunFolder,
     task: ForTask = "",
     policy: Policy = "wpt",
-    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    episodes: Annotated[int, typer.Option(min=1, help="The number of episodes.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
     device: Device = "auto",
 ) -> None:
-    """Plays a trained model on its task and shows its returns. Needs no dataset.
+    """Play a trained model on its task and show its returns. No dataset is needed.
 
     Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
     """
@@ -50,12 +61,14 @@ def enjoy_model(
     run: RunFolder,
     task: ForTask = "",
     policy: Policy = "wpt",
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial state.")] = 10_000,
-    out: Annotated[Path, typer.Option(help="The video.")] = Path("enjoy.mp4"),
-    size: Annotated[int, typer.Option(min=64, help="Its width; a multiple of 16.")] = 256,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the initial state.")] = 10_000,
+    out: Annotated[Path, typer.Option(help="The file of the video.")] = Path("enjoy.mp4"),
+    size: Annotated[
+        int, typer.Option(min=64, help="The width of the video, a multiple of 16.")
+    ] = 256,
     device: Device = "auto",
 ) -> None:
-    """Films an episode of a trained model to an mp4, which any browser plays.
+    """Film an episode of a trained model to an mp4, which any browser plays.
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -72,12 +85,12 @@ def enjoy_model(
 def diagnose_model(
     run: RunFolder,
     task: ForTask = "",
-    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 5,
-    horizon: Annotated[int, typer.Option(min=1, help="Steps to dream.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first initial state.")] = 10_000,
+    episodes: Annotated[int, typer.Option(min=1, help="The number of episodes.")] = 5,
+    horizon: Annotated[int, typer.Option(min=1, help="The number of steps to predict.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
     device: Device = "auto",
 ) -> None:
-    """Shows why a policy earns what it earns: what its world model promises, and what comes.
+    """Compare what a policy's world model predicts with what then happens.
 
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -89,18 +102,21 @@ def diagnose_model(
 
 def judge_predictions(
     model: Annotated[
-        Path, typer.Argument(help="A model file, or a run's or pre-training's folder.")
+        Path, typer.Argument(help="A model file, or the folder of a run or of a pre-training.")
     ],
-    data: Annotated[Path, typer.Argument(help="A dataset that it was not trained on.")],
+    data: Annotated[Path, typer.Argument(help="A dataset that the model was not trained on.")],
     episodes: Annotated[
-        int, typer.Option(min=1, help="Of each robot, at most, spread evenly.")
+        int, typer.Option(min=1, help="The largest number of episodes per robot, spread evenly.")
     ] = 8,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write `prediction.csv` and pictures into.")
+        Path | None,
+        typer.Option(
+            help="The folder for `prediction.csv` and pictures; none are written by default."
+        ),
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Shows how well a world model predicts: its error by horizon, beside the simplest guesses.
+    """Measure how well a world model predicts: its error by horizon, beside simple guesses.
 
     Example: `python -m wpt_agents.zoo open-loop walker.zip data/held-out --out predictions`
     """
@@ -116,13 +132,17 @@ def judge_predictions(
 
 
 def push_run(
-    run: Annotated[Path, typer.Argument(help="A finished run's folder.")],
-    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
-    private: Annotated[bool, typer.Option(help="Only you can see it.")] = False,
+    run: Annotated[Path, typer.Argument(help="The folder of a finished run.")],
+    name: Annotated[
+        str, typer.Argument(help="The repository on the Hugging Face hub: `user/name`.")
+    ],
+    private: Annotated[bool, typer.Option(help="Make a repository that only you can see.")] = False,
 ) -> None:
-    """Uploads a run to the Hugging Face hub: model, configuration, scores, video and a card.
+    """Upload a run to the Hugging Face hub: model, configuration, scores, video and a card.
 
     Log in first: `hf auth login`.
+
+    Example: `python -m wpt_agents.zoo push runs/demo/wpt/metaworld-drawer-close_0 me/drawer`
     """
     from wpt_agents.zoo.report.hub import push
 
@@ -130,12 +150,17 @@ def push_run(
 
 
 def pull_run(
-    name: Annotated[str, typer.Argument(help="`user/repository` on the Hugging Face hub.")],
-    out: Annotated[Path | None, typer.Option(help="A new folder. None: the repository's name.")] = (
-        None
-    ),
+    name: Annotated[
+        str, typer.Argument(help="The repository on the Hugging Face hub: `user/name`.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="The folder to write, the repository's name by default.")
+    ] = (None),
 ) -> None:
-    """Downloads a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`."""
+    """Download a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`.
+
+    Example: `python -m wpt_agents.zoo pull me/drawer --out drawer`
+    """
     from wpt_agents.zoo.report.hub import pull
 
     folder = pull(name, out or Path(name.rpartition("/")[2]))

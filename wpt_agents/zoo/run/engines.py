@@ -1,8 +1,8 @@
-"""Where runs are done: each in a process of its own, on a Ray cluster, or as Slurm jobs.
+"""Engines: runs in processes of their own, on a Ray cluster, or as Slurm jobs.
 
-All engines do the same: first what runs share (data, pre-trained model), then one job a run, which
-goes on from its last checkpoint if its worker died before. The folders are the same too, and must
-stand on a file system that all machines see. Ray and submitit are imported only when asked for.
+All engines do the same: first what runs share (data, pre-trained model), then one job per run,
+which resumes from its last checkpoint if its worker died before. The folders are the same, too, and
+must be on a file system that all machines see. Ray and submitit are imported only when needed.
 """
 
 import shutil
@@ -33,17 +33,17 @@ from wpt_agents.zoo.run.watch import shown
 from wpt_agents.zoo.terminal import console, say
 
 Work = Callable[[Run], None]
-Tick = Callable[[], None]  # called again and again while waiting; takes a moment
+Tick = Callable[[], None]  # called repeatedly while waiting; takes a moment
 Errors = dict[Path, str]  # by run folder, of the runs that failed
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What one job gets, and how often it is begun again when its worker dies.
+    """The resources of one job, and how often it is begun again when its worker dies.
 
-    :param hours: after which Slurm ends a job; it is sent again and goes on
-    :param address: of the Ray cluster; "" starts one on this machine
-    :param partition: Slurm's; "local" does the jobs on this machine without Slurm
+    :param hours: the time after which Slurm ends a job; it is then sent again and resumes
+    :param address: the address of the Ray cluster; "" starts one on this machine
+    :param partition: the partition of Slurm; "local" does the jobs on this machine without Slurm
     """
 
     workers: int = 2
@@ -56,8 +56,8 @@ class Resources:
     partition: str = ""
 
 
-def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> bool:
-    """Does the runs on an engine and shows where they stand.
+def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) -> bool:
+    """Do the runs on an engine and show their progress.
 
     :return: whether all are finished
     """
@@ -66,18 +66,14 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     for job in jobs:
         check_folder(job, force)
     engines: dict[str, type[Local | Ray | Slurm]] = {"local": Local, "ray": Ray, "slurm": Slurm}
-    chosen = engines[engine](given)
+    chosen = engines[engine](resources)
     left = [job for job in jobs if force or read_result(job.folder) is None]
-    anew = [job.folder for job in left] if force else []
-    with ExitStack() as held:
-        for folder in anew:  # all of them, before anything is deleted
-            held.enter_context(locked(folder / "lock"))
-        for folder in anew:
-            clear(folder)
+    if force:
+        clear_all([job.folder for job in left])
     by_need = sorted(left, key=lambda job: job.algorithm.pretrained)
     shared = {job.shared.model_path: job for job in by_need if job.algorithm.needs_data}
-    runs, cpus = counted(len(jobs), "run"), counted(given.cpus, "CPU")
-    say("engine", f"{engine}: {len(left)} of {runs} to do, {cpus} each")
+    cpus = counted(resources.cpus, "CPU")
+    say("engine", f"{engine}: {len(left)} of {counted(len(jobs), 'run')} to do, {cpus} each")
     with shown(jobs) as tick:
         if errors := chosen.map(make_shared, list(shared.values()), tick):
             reason = next(iter(errors.values()))
@@ -88,13 +84,22 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, given: Resources) -> b
     return all(read_result(job.folder) for job in jobs)
 
 
+def clear_all(folders: Sequence[Path]) -> None:
+    """Clear the folders, or none of them if another process works on one."""
+    with ExitStack() as locks:
+        for folder in folders:  # all of them, before anything is deleted
+            locks.enter_context(locked(folder / "lock"))
+        for folder in folders:
+            clear(folder)
+
+
 def _at_absolute_paths(job: Run) -> Run:
     data = job.data.resolve() if job.data is not None else None
     return replace(job, out=job.out.resolve(), data=data)
 
 
 def make_shared(job: Run) -> None:
-    """A job's work: what `job` shares with other runs."""
+    """Do the work of a job: make what `job` shares with other runs."""
     with logged(job.out / "cache" / "log.txt"):
         dataset = collect_data(job.shared)
         if job.algorithm.pretrained:
@@ -102,46 +107,52 @@ def make_shared(job: Run) -> None:
 
 
 def do(job: Run) -> None:
-    """A job's work: the run, from where it stands; what it says goes to its folder's `log.txt`."""
+    """Do the work of a job: the run, with its output in the folder's `log.txt`."""
     with logged(job.folder / "log.txt"):
         runner.run(job)
 
 
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
-    """Appends all that is printed to a file, bars too."""
+    """Append everything that is printed to a file, progress bars included."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    before = sys.stdout, sys.stderr
+    streams = sys.stdout, sys.stderr
     with open(path, "a", buffering=1) as file:
         sys.stdout = sys.stderr = file
         console.file = file
         try:
             yield
         finally:
-            sys.stdout, sys.stderr = before
+            sys.stdout, sys.stderr = streams
             console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"
 
 
 class Local:
-    """`workers` processes at a time, one a run."""
+    """`workers` processes at a time, one for each run."""
 
-    def __init__(self, given: Resources) -> None:
-        self.given = given
+    def __init__(self, resources: Resources) -> None:
+        self.resources = resources
 
     def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
-        """Does the work of each job; a job whose process is killed goes on in another."""
-        waiting, deaths, errors = deque(jobs), Counter[Path](), {}
+        """Do the work of each job; a job whose process is killed resumes in another.
+
+        :return: the errors of the jobs that failed
+        """
+        waiting = deque(jobs)
+        deaths = Counter[Path]()
+        errors = {}
         running: dict[BaseProcess, Run] = {}
         try:
             while waiting or running:
-                while waiting and len(running) < self.given.workers:
+                while waiting and len(running) < self.resources.workers:
                     job = waiting.popleft()
                     running[self.start(work, job)] = job
                 tick()
                 for process in [one for one in running if one.exitcode is not None]:
-                    job, code = running.pop(process), process.exitcode or 0
+                    job = running.pop(process)
+                    code = process.exitcode or 0
                     deaths[job.folder] += code < 0
-                    if code < 0 and deaths[job.folder] <= self.given.retries:
+                    if code < 0 and deaths[job.folder] <= self.resources.retries:
                         waiting.append(job)
                     elif code:
                         errors[job.folder] = why(job, code)
@@ -151,10 +162,10 @@ class Local:
         return errors
 
     def start(self, work: Work, job: Run) -> BaseProcess:
-        """A fresh process, so that no run inherits another's state."""
-        context = get_context("forkserver")  # which imports once what each run needs
+        """Start a new process, so that no run inherits another's state."""
+        context = get_context("forkserver")  # imports once what every run needs
         context.set_forkserver_preload([runner.__name__])
-        process = context.Process(target=_in_child, args=(work, job, self.given.cpus))
+        process = context.Process(target=_in_child, args=(work, job, self.resources.cpus))
         process.start()
         return process
 
@@ -170,7 +181,7 @@ def _in_child(work: Work, job: Run, cpus: int) -> None:
 
 
 def why(job: Run, code: int) -> str:
-    """The last line of a failed run's traceback, or the signal that ended it."""
+    """Return the last line of a failed run's traceback, or the signal that ended it."""
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
     path = job.folder / "error.txt"
@@ -178,26 +189,34 @@ def why(job: Run, code: int) -> str:
 
 
 class Ray:
-    """One task of a Ray cluster a run; Ray begins it again when its worker dies."""
+    """One task of a Ray cluster for each run; Ray begins it again when its worker dies."""
 
-    def __init__(self, given: Resources) -> None:
-        self.given, self.ray = given, import_extra("ray", "ray")
+    def __init__(self, resources: Resources) -> None:
+        self.resources = resources
+        self.ray = import_extra("ray", "ray")
         if not self.ray.is_initialized():
             try:
-                self.ray.init(address=given.address or None, log_to_driver=False)
+                self.ray.init(address=resources.address or None, log_to_driver=False)
             except Exception as error:  # Ray raises a bare one when its processes do not start
                 raise ValueError(
-                    f"No Ray cluster answers at {given.address!r} ({error}); "
+                    f"No Ray cluster answers at {resources.address!r} ({error}); "
                     "start one with `ray start --head`, or leave --address out"
                 ) from None
         self.check_resources()
 
     def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
-        """Does the work of each job; Ray does it again elsewhere when a worker dies."""
-        given, errors = self.given, {}
-        asked = {"num_cpus": given.cpus, "num_gpus": given.gpus}
-        asked |= {"memory": int(given.memory_gb * 2**30), "max_retries": given.retries}
-        task = self.ray.remote(**asked)(work)
+        """Do the work of each job.
+
+        :return: the errors of the jobs that failed
+        """
+        errors = {}
+        remote = self.ray.remote(
+            num_cpus=self.resources.cpus,
+            num_gpus=self.resources.gpus,
+            memory=int(self.resources.memory_gb * 2**30),
+            max_retries=self.resources.retries,
+        )
+        task = remote(work)
         waiting = {task.remote(job): job for job in jobs}
         while waiting:
             tick()
@@ -211,32 +230,38 @@ class Ray:
         return errors
 
     def check_resources(self) -> None:
-        """Refuses to wait for what the cluster does not have."""
-        held, given = self.ray.cluster_resources(), self.given
-        memory = given.memory_gb * 2**30
-        for name, wanted in (("CPU", given.cpus), ("GPU", given.gpus), ("memory", memory)):
-            if held.get(name, 0) < wanted:
+        """Refuse to wait for resources that the cluster does not have."""
+        cluster = self.ray.cluster_resources()
+        resources = self.resources
+        memory = resources.memory_gb * 2**30
+        for name, asked in (("CPU", resources.cpus), ("GPU", resources.gpus), ("memory", memory)):
+            if cluster.get(name, 0) < asked:
                 raise ValueError(
-                    f"The Ray cluster has {held.get(name, 0):g} {name}, a run asks for {wanted:g}: "
-                    "ask for less (--cpus, --gpus, --memory-gb), or add machines"
+                    f"The Ray cluster has {cluster.get(name, 0):g} {name}, a run asks for "
+                    f"{asked:g}: ask for less (--cpus, --gpus, --memory-gb), or add machines"
                 )
 
 
 class Slurm:
-    """One Slurm job a run, through submitit; preempted or out of time, it is sent again."""
+    """One Slurm job for each run, through submitit; it is sent again when it is preempted."""
 
-    def __init__(self, given: Resources) -> None:
-        self.given, self.submitit = given, import_extra("submitit", "slurm")
-        if given.partition != "local" and shutil.which("srun") is None:
+    def __init__(self, resources: Resources) -> None:
+        self.resources = resources
+        self.submitit = import_extra("submitit", "slurm")
+        if resources.partition != "local" and shutil.which("srun") is None:
             raise ValueError(
                 "--engine slurm: there is no `srun` here; start it on a login node of the cluster, "
                 "or try it out with --partition local"
             )
 
     def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
-        """Does the work of each job; those that failed, with their errors."""
-        given, errors = Preemptible(work, self.given.cpus), {}
-        sent = [(job, self.executor(job.out).submit(given, job)) for job in jobs]
+        """Do the work of each job.
+
+        :return: the errors of the jobs that failed
+        """
+        preemptible = Preemptible(work, self.resources.cpus)
+        errors = {}
+        sent = [(job, self.executor(job.out).submit(preemptible, job)) for job in jobs]
         while not all(handle.done() for _, handle in sent):
             tick()
         for job, handle in sent:
@@ -245,18 +270,19 @@ class Slurm:
         return errors
 
     def executor(self, out: Path) -> Any:
-        """submitit's, with the resources asked for; its logs go to `out/slurm`."""
-        given, local = self.given, self.given.partition == "local"
+        """Return submitit's executor with the resources; its logs go to `out/slurm`."""
+        resources = self.resources
+        local = resources.partition == "local"
         executor = self.submitit.AutoExecutor(out / "slurm", cluster="local" if local else "slurm")
         executor.update_parameters(
             name="wpt",
-            timeout_min=int(given.hours * 60),
-            cpus_per_task=given.cpus,
-            mem_gb=given.memory_gb,
-            gpus_per_node=int(given.gpus),
+            timeout_min=int(resources.hours * 60),
+            cpus_per_task=resources.cpus,
+            mem_gb=resources.memory_gb,
+            gpus_per_node=int(resources.gpus),
         )
-        if given.partition and not local:
-            executor.update_parameters(slurm_partition=given.partition)
+        if resources.partition and not local:
+            executor.update_parameters(slurm_partition=resources.partition)
         return executor
 
 
@@ -268,10 +294,10 @@ class Preemptible:
     cpus: int = 1
 
     def __call__(self, job: Run) -> None:
-        """Does it."""
+        """Do the work."""
         _in_process(self.work, job, self.cpus)
 
     def checkpoint(self, job: Run) -> Any:
-        """What submitit asks for on preemption."""
+        """Return what submitit sends again after a preemption."""
         submitit = import_extra("submitit", "slurm")
         return submitit.helpers.DelayedSubmission(self, job)

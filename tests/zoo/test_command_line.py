@@ -1,0 +1,65 @@
+"""How the command line starts, helps and fails."""
+
+import pytest
+from typer.main import get_command
+from zoo_command import call
+
+from wpt_agents.zoo.commands import app as command_line
+
+GROUP = get_command(command_line.app)
+COMMANDS = {name: command for name, command in GROUP.commands.items()}
+LEAVES = {
+    f"{name} {inner}".strip(): leaf
+    for name, command in COMMANDS.items()
+    for inner, leaf in getattr(command, "commands", {"": command}).items()
+}
+
+
+def test_without_a_command_three_commands_to_start_with_are_shown(monkeypatch, capsys):
+    assert call(monkeypatch) == 0
+    shown = capsys.readouterr().out
+    commands = [line.split()[3] for line in shown.splitlines() if line.startswith("  python -m")]
+    assert commands == ["list", "run", "report"] and set(commands) <= COMMANDS.keys()
+
+
+@pytest.mark.parametrize("name", LEAVES)
+def test_each_command_has_an_example_and_describes_every_option(name):
+    command = LEAVES[name]
+    assert f"Example: `python -m wpt_agents.zoo {name} " in command.help
+    for option in command.params:
+        assert option.name in ("help", "seed") or option.help, option.name
+
+
+def fail(error):
+    def load(*_, **__):
+        raise error
+
+    return load
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence", "code"),
+    [
+        (ValueError("no such thing"), "Error: no such thing\n", 2),
+        (FileNotFoundError("There is no x"), "Error: There is no x\n", 2),
+        (
+            ModuleNotFoundError("No module named 'dm_control'", name="dm_control"),
+            'Error: dm_control is not installed: pip install "wpt-agents[all]"\n',
+            2,
+        ),
+        (
+            KeyError("x"),
+            "Error: KeyError: 'x' (add --debug to see where, and please report it)\n",
+            1,
+        ),
+    ],
+)
+def test_an_error_is_one_sentence_and_debug_shows_where(
+    error, sentence, code, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr("wpt_agents.zoo.judge.trained.find_trained", fail(error))
+    assert call(monkeypatch, "eval", tmp_path) == code
+    assert capsys.readouterr().err == sentence
+    assert call(monkeypatch, "eval", tmp_path, "--debug") == code
+    shown = capsys.readouterr().err
+    assert shown.startswith("Traceback") and shown.endswith(sentence)

@@ -1,0 +1,39 @@
+"""A plan is shown, or checked and done: here, or on an engine."""
+
+from collections.abc import Sequence
+
+import typer
+
+from wpt_agents.zoo.machine import check_machine
+from wpt_agents.zoo.plan.estimate import check_space, summary
+from wpt_agents.zoo.plan.overview import show_plan
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.run.engines import Resources, run_on
+from wpt_agents.zoo.run.folder import check_folder
+from wpt_agents.zoo.run.runner import run_all
+
+
+def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
+    """Refuse, before anything is done, what this machine, its disk or the folders do not allow."""
+    check_machine(engine, runs[0].device)
+    check_space(runs)
+    for run in runs:
+        check_folder(run, force)
+
+
+def preview(runs: Sequence[Run], engine: str, force: bool) -> None:
+    """Print what would be done, then end in what would be refused."""
+    show_plan(runs, force)
+    typer.echo(summary(runs, force))
+    check_plan(runs, engine, force)
+
+
+def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources) -> bool:
+    """Check the runs, then do them.
+
+    :return: whether all are finished
+    """
+    check_plan(runs, engine, force)
+    if engine == "none":
+        return run_all(runs, force)
+    return run_on(engine, runs, force, resources)

@@ -31,7 +31,14 @@ PUBLIC = {
     "collect": "wpt_agents.zoo.collect.collection",
 }
 __all__ = [
-    *("JSRL", "R3M", "RLPD", "WPT", "DrQv2", "PackNet", "Trajectory", "TrajectoryDataset"),
+    "JSRL",
+    "R3M",
+    "RLPD",
+    "WPT",
+    "DrQv2",
+    "PackNet",
+    "Trajectory",
+    "TrajectoryDataset",
     "collect",
 ]
 __version__ = "0.1.0"

@@ -67,7 +67,7 @@ test: rendering
 	@$(BIN)/python -m pytest -m "not nightly" $(TEST_ARGS)
 
 learn: $(INSTALLED)
-	@$(BIN)/python -m pytest tests/test_learning.py --seeds 3 -v --durations 3
+	@$(BIN)/python -m pytest tests/agents/test_learning.py --seeds 3 -v --durations 3
 
 lint: $(INSTALLED)
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/codespell && $(BIN)/mypy wpt_agents envs

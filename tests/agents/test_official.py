@@ -15,7 +15,8 @@ from gymnasium import spaces
 from toy_env import DotEnv
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.fast.acting import FastActor, FastStep
+from wpt_agents.fast.acting import FastStep
+from wpt_agents.fast.acting_networks import FastActor
 from wpt_agents.files.official import PARTS
 from wpt_agents.model.images import to_unit
 from wpt_agents.model.ops import definitions

@@ -15,8 +15,9 @@ from debug_agent import agent, noise
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents.fast import acting
-from wpt_agents.fast.acting import PATCHES, fast_step, networks_are_known
+from wpt_agents.fast import acting, acting_networks
+from wpt_agents.fast.acting import fast_step, networks_are_known
+from wpt_agents.fast.acting_networks import PATCHES
 from wpt_agents.model.ops import definitions
 from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.sizes import SIZES
@@ -25,7 +26,7 @@ NAMES = ("deter", "stoch", "action")
 
 
 def acted(policy, n, deterministic=False, steps=3):
-    """State and action after some steps, one environment starting anew at the last of them."""
+    """State and action after some steps; at the last of them, one environment begins an episode."""
     state, generator = None, torch.Generator().manual_seed(0)
     for t in range(steps):
         first = np.arange(n) == (n - 1 if t == steps - 1 else -1)
@@ -58,7 +59,7 @@ def test_the_quick_step_is_the_defined_one(size, deterministic, n):
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_a_wide_z_picks_rows(n, monkeypatch):
-    monkeypatch.setattr(acting, "WIDE_STOCH", 64)
+    monkeypatch.setattr(acting_networks, "WIDE_STOCH", 64)
     policy = agent(size="tiny").policy
     assert fast_step(policy).outputs.from_stoch.rows is not None
     assert_defined(policy, n)
@@ -118,9 +119,7 @@ def test_updates_and_loaded_and_replaced_weights_are_noticed():
 def test_images_may_lie_in_memory_as_they_like():
     policy, image = agent().policy, noise(2)
     turned = np.ascontiguousarray(image.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
-    action, other = (
-        policy.act(each, None, None, deterministic=True)[0] for each in (image, turned)
-    )
+    action, other = (policy.act(x, None, None, deterministic=True)[0] for x in (image, turned))
     np.testing.assert_array_equal(action, other)
 
 

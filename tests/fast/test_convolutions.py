@@ -41,8 +41,8 @@ def test_an_upconv_by_phases_is_the_transposed_convolution_on_the_way_back_too(k
     expected = torch.autograd.grad((plain * weight).sum(), leaves)
     image = up_conv_by_phases(*leaves)  # as in bfloat16
     torch.testing.assert_close(image, plain, rtol=1e-12, atol=1e-12)
-    found = torch.autograd.grad((image * weight).sum(), leaves)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    gradients = torch.autograd.grad((image * weight).sum(), leaves)
+    torch.testing.assert_close(gradients, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_pixels_by_parity_are_those_of_the_image():

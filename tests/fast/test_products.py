@@ -29,13 +29,13 @@ def test_many_rows_go_through_a_convolution_which_is_the_matrix_product(blocks, 
     bias = noise(outputs, seed=2).requires_grad_() if bias else None
     leaves = [wide, weight] + ([] if bias is None else [bias])
     plain = x @ torch.block_diag(*weight) + (0 if bias is None else bias)
-    found = block_linear(x, weight, bias) if blocks > 1 else linear(x, weight[0].t(), bias)
+    result = block_linear(x, weight, bias) if blocks > 1 else linear(x, weight[0].t(), bias)
     assert "convolution" in ran(lambda: block_linear(x, weight, bias))
     assert "convolution" in ran(lambda: linear(x, weight.new_ones(5, inputs)))
-    torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(result, plain, rtol=1e-5, atol=1e-5)
     slope = noise(rows, outputs, seed=3)
     expected = torch.autograd.grad(plain, leaves, slope)
-    gradients = torch.autograd.grad(found, leaves, slope)
+    gradients = torch.autograd.grad(result, leaves, slope)
     torch.testing.assert_close(gradients, expected, rtol=1e-4, atol=1e-4)  # of sums of 512 rows
     in_time = linear(x.unflatten(0, (4, -1)), noise(5, inputs))  # (B, T, inputs)
     torch.testing.assert_close(in_time.flatten(0, 1), x @ noise(5, inputs).t())

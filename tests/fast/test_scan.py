@@ -22,7 +22,7 @@ def ways(unimix, size=SIZE):
     rssm = RSSM(size, A, E, unimix)
     is_first = torch.zeros(B, T, dtype=torch.bool)
     is_first[:, 0] = is_first[1, 3] = is_first[2, 6] = True
-    is_first[3, 0] = False  # goes on with the state given
+    is_first[3, 0] = False  # continues from the first state
     leaves = [
         noise(B, T, size.hidden),
         noise(B, T, size.hidden, seed=1),
@@ -43,11 +43,11 @@ def outcome(way, rssm, leaves, is_first):
     outside = {id(p) for layer in layers for p in layer.parameters()}
     weights = {n: p for n, p in rssm.named_parameters() if id(p) not in outside}
     del weights["post_in.bias"]  # is in embed_half, here a leaf
-    wanted = dict(zip(("embed", "action", "deter", "stoch"), leaves, strict=True)) | weights
+    inputs = dict(zip(("embed", "action", "deter", "stoch"), leaves, strict=True)) | weights
     first, second = (
-        torch.autograd.grad(total, list(wanted.values()), retain_graph=True) for _ in range(2)
+        torch.autograd.grad(total, list(inputs.values()), retain_graph=True) for _ in range(2)
     )
-    return outputs, dict(zip(wanted, first, strict=True)), dict(zip(wanted, second, strict=True))
+    return outputs, dict(zip(inputs, first, strict=True)), dict(zip(inputs, second, strict=True))
 
 
 @pytest.mark.parametrize(

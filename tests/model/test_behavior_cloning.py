@@ -89,11 +89,11 @@ def test_a_shift_moves_all_frames_of_a_row_alike_and_repeats_the_border():
         .unflatten(0, (50, FRAMES))
     )
     places = [(i, j) for i in range(7) for j in range(7)]
-    found = [
+    matches = [
         [p for p in places if torch.equal(moved[n].float(), crop(padded[n], *p))] for n in range(50)
     ]
-    assert all(len(each) == 1 for each in found)
-    assert len({each[0] for each in found}) > 20  # of 49
+    assert all(len(match) == 1 for match in matches)
+    assert len({match[0] for match in matches}) > 20  # of 49
 
 
 def crop(padded, i, j):

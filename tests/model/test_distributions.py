@@ -181,12 +181,12 @@ def test_entropy_gradient_is_finite_where_the_mean_is_saturated():
 def test_padded_entries_are_zero_and_count_nothing():
     mask = torch.tensor([True, False])
     mean, std = torch.tensor([[0.2, 0.9]]), torch.tensor([[0.5, 0.1]])
-    padded, own = TruncatedNormal(mean, std, mask), normal(0.2, 0.5)
+    padded, alone = TruncatedNormal(mean, std, mask), normal(0.2, 0.5)
     assert padded.rsample(seeded())[0, 1] == padded.mode[0, 1] == 0
     torch.testing.assert_close(
-        padded.log_prob(torch.tensor([[0.1, 7.0]]))[0], own.log_prob(torch.tensor([0.1]))
+        padded.log_prob(torch.tensor([[0.1, 7.0]]))[0], alone.log_prob(torch.tensor([0.1]))
     )
-    torch.testing.assert_close(padded.entropy()[0], own.entropy())
+    torch.testing.assert_close(padded.entropy()[0], alone.entropy())
 
 
 def test_padded_entries_get_no_gradient():

@@ -21,7 +21,8 @@ from wpt_agents.data.transitions import Transitions
 from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.frames import FrameEncoder, Trunk, mlp, orthogonal
-from wpt_agents.model.networks import Size, frozen
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.sizes import Size
 from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.training.keywords import Stage, amount, count, schedule, share
 from wpt_agents.training.randomness import Purpose

@@ -24,7 +24,8 @@ from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.ensembles import CriticEnsemble, RewardEnsemble
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.frames import FrameEncoder, xavier
-from wpt_agents.model.networks import Size, frozen
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.sizes import Size
 from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
 from wpt_agents.training.keywords import Stage, amount, choice, count, share
 from wpt_agents.training.randomness import Purpose

@@ -4,7 +4,8 @@ import torch
 from torch import Generator, Tensor, nn
 
 from wpt_agents.model.distributions import BINS, TruncatedNormal, two_hot_loss, two_hot_mean
-from wpt_agents.model.networks import Head, Size
+from wpt_agents.model.layers import Head
+from wpt_agents.model.sizes import Size
 
 CONTEXT = 3  # images behind a state from which on more of them improve predictions no further
 
@@ -32,7 +33,8 @@ def draw_starts(
     Algorithm 1 starts from all of them, and `number` 0 does so here. Gradients differ little from
     start to start, so a random subset teaches about as much at a fraction of the cost. Every row
     contributes the same number of states (to within one), which keeps the share of retrieved rows.
-    States that have seen fewer than three images are left out, because they know little.
+    States that have seen fewer than three images are left out, because they know little. This is a
+    deviation from the paper, by the sizes that set `Size.imagine_starts`.
 
     :param number: how many, drawn without replacement; at most those with three images behind them
     :return: (N,) indices into the flattened states, sorted
@@ -40,8 +42,8 @@ def draw_starts(
     blind = CONTEXT - 1 if length >= CONTEXT else 0
     if number == 0 or number > batch_size * (length - blind):
         first = 0 if number == 0 else blind
-        every = torch.arange(batch_size * length, device=device).view(batch_size, length)
-        return every[:, first:].flatten()
+        index = torch.arange(batch_size * length, device=device).view(batch_size, length)
+        return index[:, first:].flatten()
     order = torch.rand(batch_size, length, device=device, generator=generator)
     order[:, :blind] = 2.0  # behind all others
     ends = torch.arange(batch_size + 1, device=device) * number // batch_size
@@ -69,12 +71,12 @@ def actor_loss(
 ) -> Tensor:
     """Eq. (4): -V_t - η H[a_t | s_t], averaged, step t weighing γ^t.
 
-    V_0 holds the reward of the starting state, which no imagined action caused, so the returns of
-    the steps 1 .. H-1 are what the actions of the steps 0 .. H-2 are judged by.
+    V_0 contains the reward of the starting state, which no imagined action caused. So the actions
+    of the steps 0 .. H-2 are judged by the returns of the steps 1 .. H-1.
 
     :param lambda_return: (B, H), with its gradient through the dynamics
     :param entropy: (B, H), of the actor at the steps 0 .. H-1
-    :param return_scale: what returns are divided by; 1 in the paper
+    :param return_scale: divides the returns; 1 in the paper
     """
     assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
     weight = discounts(entropy.shape[1] - 1, gamma, like=entropy)
@@ -88,7 +90,7 @@ def discounts(length: int, gamma: float, like: Tensor) -> Tensor:
 
 
 def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -> Tensor:
-    """The width of the returns between two quantiles, DreamerV3's scale for the actor's loss."""
+    """Return the range between two quantiles of the returns, by which DreamerV3 divides them."""
     quantiles = torch.quantile(
         lambda_return.detach().flatten(),
         torch.tensor([low, high], device=lambda_return.device),
@@ -98,7 +100,7 @@ def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -
 
 @torch.no_grad()
 def ema_update(target: nn.Module, source: nn.Module, fraction: float = 0.02) -> None:
-    """Moves `target` towards `source` by `fraction`."""
+    """Move `target` towards `source` by `fraction`: t + fraction (s - t)."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), fraction)
 
 
@@ -116,7 +118,7 @@ class Actor(Head):
                 parameter.mul_(outscale)
 
     def dist(self, feat: Tensor, mask: Tensor) -> TruncatedNormal:
-        """The action distribution.
+        """Return the action distribution.
 
         :param feat: (..., D + S*K)
         :param mask: (A,) bool, True at the embodiment's own entries
@@ -125,17 +127,17 @@ class Actor(Head):
 
     @staticmethod
     def truncated(outputs: Tensor, mask: Tensor) -> TruncatedNormal:
-        """The distribution that the network's outputs (..., 2 A) stand for."""
+        """Return the distribution that the network's outputs (..., 2 A) parametrise."""
         mean, std = outputs.float().chunk(2, -1)
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
 
 
 class Critic(Head):
-    """v(V | s): a distribution over returns, symlog two-hot."""
+    """v(V | s): a distribution over returns, two-hot in symlog space."""
 
     def __init__(self, size: Size, zero_init: bool = False) -> None:
         super().__init__(size, 3, BINS, zero_init)
 
     def value(self, feat: Tensor) -> Tensor:
-        """The mean return: (..., D + S*K) -> (...)."""
+        """Return the mean return: (..., D + S*K) -> (...)."""
         return two_hot_mean(self(feat))

@@ -7,17 +7,19 @@ import torch
 from torch import Generator, Tensor, nn
 
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.networks import Encoder, Linear, LinearNorm, Size
+from wpt_agents.model.images import Encoder
+from wpt_agents.model.layers import Linear, LinearNorm
+from wpt_agents.model.sizes import Size
 
-FRAMES = 3  # what one image does not show, such as velocities, three do
+FRAMES = 3  # a single image does not show velocities
 
 
 def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
-    """-log π_bc(a | o) of a Gaussian of fixed variance, up to constants: the squared error.
+    """-log π_bc(a | o) of a Gaussian with fixed variance, up to constants: the squared error.
 
     :param prediction: (N, A), the Gaussian's mean
     :param action: (N, A), taken at the observation
-    :param mask: (A,) bool, True at the embodiment's own entries; the others count nothing
+    :param mask: (A,) bool, True at the embodiment's own entries; the others do not count
     """
     assert prediction.shape == action.shape, (prediction.shape, action.shape)
     return ((prediction - action).square() * mask).sum() / (mask.sum() * len(action))
@@ -26,9 +28,10 @@ def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
 def draw_pairs(
     trajectories: Sequence[Trajectory], n: int, action_dim: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Draws n of all trajectories' steps: what was seen, and the action that was then taken.
+    """Draw n steps of all trajectories: the images seen, and the action that was then taken.
 
-    Before an episode's third image its first one stands for those that are missing, as in acting.
+    Before an episode's third image, its first image takes the place of the missing ones, as in
+    acting.
 
     :return: images (n, F, 64, 64, 3) uint8, oldest first, and actions (n, A), padded with zeros
     """
@@ -46,7 +49,7 @@ def draw_pairs(
 
 
 def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:
-    """Moves each stack of frames by up to `pad` pixels, repeating the border.
+    """Shift each stack of frames by up to `pad` pixels, repeating the border.
 
     :param image: (N, F, H, W, C)
     """
@@ -54,15 +57,15 @@ def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None
     shift = torch.randint(-pad, pad + 1, (n, 2), device=image.device, generator=generator)
     rows = (torch.arange(height, device=image.device) + shift[:, :1]).clamp(0, height - 1)
     columns = (torch.arange(width, device=image.device) + shift[:, 1:]).clamp(0, width - 1)
-    which = torch.arange(n, device=image.device)[:, None, None]
-    moved = image.transpose(1, 2).transpose(2, 3)  # (N, H, W, F, C): one index does all frames
-    return moved[which, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2, 4)
+    index = torch.arange(n, device=image.device)[:, None, None]
+    frames_last = image.permute(0, 2, 3, 1, 4)  # (N, H, W, F, C): one index moves all frames
+    return frames_last[index, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2, 4)
 
 
 def recent_frames(image: Tensor, is_first: Tensor) -> Tensor:
-    """What the prior actor sees at each image of a window, from its third one on.
+    """Return what the prior actor sees at each image of a sequence, from its third image on.
 
-    Where an episode begins inside the window, its first image stands for those that are missing.
+    Where an episode begins inside the sequence, its first image takes the place of missing ones.
 
     :param image: (B, T, 64, 64, 3)
     :param is_first: (B, T) bool
@@ -71,14 +74,14 @@ def recent_frames(image: Tensor, is_first: Tensor) -> Tensor:
     time = torch.arange(image.shape[1], device=image.device)
     begun = torch.where(is_first, time, 0).cummax(1).values
     before = torch.arange(1 - FRAMES, 1, device=image.device)
-    wanted = torch.maximum(time[:, None] + before, begun[..., None])[:, FRAMES - 1 :]
-    return image[torch.arange(len(image), device=image.device)[:, None, None], wanted]
+    times = torch.maximum(time[:, None] + before, begun[..., None])[:, FRAMES - 1 :]
+    return image[torch.arange(len(image), device=image.device)[:, None, None], times]
 
 
 class PriorActor(nn.Module):
     """π_bc(a | o): its own encoder over three stacked frames, then an MLP.
 
-    :param size: the widths; its own are half as deep
+    :param size: the widths; the encoder has half the depth, at least 8
     :param action_dim: the padded action width, A
     """
 

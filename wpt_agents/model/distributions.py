@@ -6,49 +6,50 @@ from collections.abc import Iterable
 import torch
 from torch import Generator, Tensor
 
-BINS = 255  # of the two-hot heads, evenly spaced over [-20, 20] in symlog space
+BINS = 255  # of the two-hot heads, evenly spaced over [-20, 20] in symlog space, as in DreamerV3
 SQRT2 = math.sqrt(2.0)
 
 
 class Share(Generator):
-    """A generator for some of a batch's rows: each row gets what it would get in the whole batch.
+    """A generator for some rows of a batch: each row gets the numbers it gets in the whole batch.
 
-    :param rows: of the whole batch
-    :param first: which of them the first row here is
+    :param rows: number of rows of the whole batch
+    :param first: the number, in the whole batch, of the first row here
     """
 
     def __new__(cls, device: torch.device | str, rows: int, first: int) -> "Share":
-        """Torch's generators take their device here."""
+        """Pass the device on: torch's generators take it here and not in `__init__`."""
         return super().__new__(cls, device)  # type: ignore[call-arg]  # torch's stub has no __new__
 
     def __init__(self, device: torch.device | str, rows: int, first: int) -> None:
-        self.rows, self.first = rows, first
+        self.rows = rows
+        self.first = first
 
 
 class Drawn:
-    """Random numbers drawn before, in the order of their use: what compiled code takes."""
+    """Random numbers drawn before, in the order of their use: compiled code has no generators."""
 
     def __init__(self, draws: Iterable[Tensor]) -> None:
         self.left = list(draws)
 
     def next(self) -> Tensor:
-        """The next in order."""
+        """Return the next numbers."""
         return self.left.pop(0)
 
 
 Noise = Generator | Drawn | None
-"""Where random numbers come from; None: torch's own generator."""
+"""The source of random numbers; None is torch's own generator."""
 
 
 def uniform(like: Tensor, generator: Noise = None) -> Tensor:
-    """Draws from [0, 1), in the shape of `like`."""
+    """Draw from [0, 1) in the shape of `like`."""
     if isinstance(generator, Drawn):
         return generator.next()
     return torch.rand(like.shape, device=like.device, generator=generator)
 
 
 def exponential(like: Tensor, generator: Noise = None) -> Tensor:
-    """Draws of Exp(1), in the shape of `like`: (N, ...)."""
+    """Draw from Exp(1) in the shape of `like`, (N, ...)."""
     if isinstance(generator, Drawn):
         return generator.next()
     if not isinstance(generator, Share):
@@ -58,20 +59,20 @@ def exponential(like: Tensor, generator: Noise = None) -> Tensor:
 
 
 def symlog(x: Tensor) -> Tensor:
-    """`sign(x) ln(|x| + 1)`: squeezes rewards and returns of any scale."""
+    """`sign(x) ln(|x| + 1)`: compresses rewards and returns of any scale."""
     return torch.sign(x) * torch.log1p(x.abs())
 
 
 def symexp(x: Tensor) -> Tensor:
-    """The inverse of symlog."""
-    return torch.where(x < 0, -torch.expm1(-x), torch.expm1(x))  # slope 1 at zero, too
+    """`sign(x) (e^|x| - 1)`, the inverse of symlog."""
+    return torch.where(x < 0, -torch.expm1(-x), torch.expm1(x))  # unlike with sign, of slope 1 at 0
 
 
 def two_hot(x: Tensor, bins: int = BINS) -> Tensor:
-    """symlog(x) as weights on the two nearest bins.
+    """Express symlog(x) as weights on the two nearest bins.
 
-    :param x: (...), any real number; beyond symexp(20) it is clipped
-    :return: (..., bins), at most two entries are not zero, the sum is 1
+    :param x: (...), any real number; it is clipped at symexp(20)
+    :return: (..., bins), of which at most two are not zero and the sum is 1
     """
     position = (symlog(x).clamp(-20, 20) + 20) * (bins - 1) / 40
     below = position.floor().clamp(max=bins - 2)
@@ -82,7 +83,7 @@ def two_hot(x: Tensor, bins: int = BINS) -> Tensor:
 
 
 def two_hot_mean(logits: Tensor) -> Tensor:
-    """The mean bin, through symexp: (..., bins) logits -> (...)."""
+    """Symexp of the mean bin: (..., bins) logits -> (...)."""
     logits = logits.float()
     bins = torch.linspace(-20, 20, logits.shape[-1], device=logits.device)
     return symexp((logits.softmax(-1) * bins).sum(-1))  # a matmul would fall to bfloat16
@@ -92,7 +93,7 @@ def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
     """-ln p(target): cross entropy with the two-hot target.
 
     :param logits: (..., bins)
-    :param target: (...), in the target's own units
+    :param target: (...), before symlog
     :return: (...)
     """
     logits = logits.float()
@@ -109,19 +110,19 @@ def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:
 
 
 def sample_one_hot(logits: Tensor, generator: Noise = None) -> Tensor:
-    """A one-hot sample whose gradient is that of the probabilities (straight-through).
+    """Draw a one-hot sample whose gradient is that of the probabilities (straight-through).
 
     :param logits: (..., K) log-probabilities
     :return: (..., K)
     """
     probs = logits.exp()
-    # the largest of p_k / E_k, E_k ~ Exp(1), is class k with probability p_k
+    # with E_k ~ Exp(1), the largest p_k / E_k is that of class k with probability p_k
     race = exponential(probs, generator)
     return _straight_through(probs, (probs.detach() / race).argmax(-1))
 
 
 def mode_one_hot(logits: Tensor) -> Tensor:
-    """The likeliest class, one-hot and straight-through: (..., K) -> (..., K)."""
+    """Return the most likely class, one-hot and straight-through: (..., K) -> (..., K)."""
     return _straight_through(logits.exp(), logits.argmax(-1))
 
 
@@ -141,7 +142,7 @@ def kl_one_hot(left: Tensor, right: Tensor) -> Tensor:
 
 
 class TruncatedNormal:
-    """Independent normals cut to [-1, 1], the padded entries left out.
+    """Independent normal distributions truncated to [-1, 1], without the padded entries.
 
     :param mean: (..., A), in [-1, 1]
     :param std: (..., A), positive
@@ -149,31 +150,38 @@ class TruncatedNormal:
     """
 
     def __init__(self, mean: Tensor, std: Tensor, mask: Tensor) -> None:
-        self.mean, self.std, self.mask = mean.float(), std.float(), mask
+        self.mean = mean.float()
+        self.std = std.float()
+        self.mask = mask
         self.low = (-1 - self.mean) / self.std
         self.high = (1 - self.mean) / self.std
-        self.low_cdf, high_cdf = _cdf(self.low), _cdf(self.high)
-        self.mass = (high_cdf - self.low_cdf).clamp_min(1e-6)
+        self.low_cdf = _cdf(self.low)
+        self.mass = (_cdf(self.high) - self.low_cdf).clamp_min(1e-6)  # its logarithm is taken
 
     @property
     def mode(self) -> Tensor:
-        """(..., A): the mean of the uncut normal, which lies inside."""
+        """(..., A): the mean of the normal before truncation, which lies in [-1, 1]."""
         return self.mean * self.mask
 
     def rsample(self, generator: Noise = None) -> Tensor:
-        """(..., A): a sample by the inverse cumulative, differentiable in mean and std."""
+        """Draw by the inverse of the cumulative distribution, differentiable in mean and std."""
         cdf = self.low_cdf + uniform(self.mean, generator) * self.mass
+        # clamped because erfinv is infinite at -1 and 1
         z = SQRT2 * torch.erfinv((2 * cdf - 1).clamp(-1 + 1e-6, 1 - 1e-6))
         return (self.mean + self.std * z).clamp(-1, 1) * self.mask
 
     def log_prob(self, action: Tensor) -> Tensor:
-        """(..., A) -> (...), summed over the true entries."""
+        """(..., A) -> (...), summed over the entries that are not padded."""
         z = (action - self.mean) / self.std
         log_prob = -0.5 * z * z - self.std.log() - 0.5 * math.log(2 * math.pi) - self.mass.log()
         return (log_prob * self.mask).sum(-1)
 
     def entropy(self) -> Tensor:
-        """(...): exact, summed over the true entries."""
+        """(...): the exact entropy, summed over the entries that are not padded.
+
+        With α and β the standardised bounds and Z the mass between them, it is
+        ln(sqrt(2πe) s Z) + (α φ(α) - β φ(β)) / (2 Z).
+        """
         tails = (self.low * _pdf(self.low) - self.high * _pdf(self.high)) / (2 * self.mass)
         constant = 0.5 * math.log(2 * math.pi * math.e)
         return ((constant + self.std.log() + self.mass.log() + tails) * self.mask).sum(-1)

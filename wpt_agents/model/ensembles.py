@@ -63,7 +63,8 @@ class CriticEnsemble(nn.Module):
     def forward(self, embed: Tensor, action: Tensor) -> Tensor:
         """(N, E), (N, A) -> (K, N)."""
         inputs = torch.cat([self.trunk(embed), action], -1)
-        return self.layers(inputs.expand(self.members, -1, -1)).squeeze(-1)
+        values: Tensor = self.layers(inputs.expand(self.members, -1, -1))
+        return values.squeeze(-1)
 
 
 class RewardEnsemble(nn.Module):
@@ -87,4 +88,5 @@ class RewardEnsemble(nn.Module):
 
     def forward(self, latent: Tensor) -> Tensor:
         """(N, Z) -> (K, N)."""
-        return self.layers(latent.expand(self.members, -1, -1)).squeeze(-1)
+        rewards: Tensor = self.layers(latent.expand(self.members, -1, -1))
+        return rewards.squeeze(-1)

@@ -11,9 +11,9 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import IMAGE_SIZE
 from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.networks import Size
 from wpt_agents.model.observations import Observation, to_images
 from wpt_agents.model.policy import State, stack_frames
+from wpt_agents.model.sizes import Size
 
 
 class FramePolicy(BasePolicy):
@@ -32,7 +32,7 @@ class FramePolicy(BasePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         clone_size: Size | None = None,
     ) -> None:

@@ -66,7 +66,7 @@ class Op(Generic[P, R]):
         return self.definition(*args, **kwargs)
 
 
-op = Op  # as it is written above a definition
+op = Op  # the name of the decorator
 
 
 @contextmanager

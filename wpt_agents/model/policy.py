@@ -337,7 +337,7 @@ def stack_frames(
         return np.repeat(image[:, None], FRAMES, 1)
     check_state((frames,), ((FRAMES, *image.shape[1:]),), len(image))
     first = check_episode_start(episode_start, len(image))
-    moved = np.concatenate([frames[:, 1:], image[:, None]], 1)
+    moved: np.ndarray = np.concatenate([frames[:, 1:], image[:, None]], 1)
     moved[first] = image[first, None]
     return moved
 

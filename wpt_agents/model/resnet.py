@@ -39,7 +39,8 @@ class Block(nn.Module):
         for i in range(1, self.layers + 1):
             x = getattr(self, f"bn{i}")(getattr(self, f"conv{i}")(x))
             x = x.relu() if i < self.layers else x
-        return (x + shortcut).relu()
+        out: Tensor = (x + shortcut).relu()
+        return out
 
 
 class ResNet(nn.Module):
@@ -84,7 +85,8 @@ class ResNet(nn.Module):
         x = self.maxpool(self.bn1(self.conv1((x - self.mean) / self.std)).relu())
         for stage in range(1, 5):
             x = getattr(self, f"layer{stage}")(x)
-        return x.mean((2, 3))
+        features: Tensor = x.mean((2, 3))
+        return features
 
 
 def read_r3m(path: str) -> dict[str, Tensor]:

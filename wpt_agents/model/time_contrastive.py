@@ -88,4 +88,5 @@ def random_crop(clips: Tensor, rng: np.random.Generator) -> Tensor:
     planes = clips.permute(0, 1, 4, 2, 3).flatten(1, 2).float()
     grid = F.affine_grid(torch.from_numpy(theta).to(clips.device), list(planes.shape), False)
     cut = F.grid_sample(planes, grid, padding_mode="border", align_corners=False)
-    return cut.unflatten(1, (3, 3)).permute(0, 1, 3, 4, 2)
+    frames: Tensor = cut.unflatten(1, (3, 3))
+    return frames.permute(0, 1, 3, 4, 2)

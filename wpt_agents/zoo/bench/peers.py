@@ -20,7 +20,7 @@ from gymnasium.spaces import Box, Dict
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Batch
-from wpt_agents.model.networks import SIZES, Size
+from wpt_agents.model.sizes import SIZES, Size
 from wpt_agents.zoo.bench.model import (
     ACTIONS,
     agent,

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.optim import SGD
 
 from wpt_agents.agents.base import PixelAgent
-from wpt_agents.model.policy import to_images
+from wpt_agents.model.observations import to_images
 from wpt_agents.training.keywords import Keywords, Stage, amount, count, share
 from wpt_agents.training.randomness import Purpose
 

@@ -22,7 +22,8 @@ from wpt_agents.model.actor_critic import (
 )
 from wpt_agents.model.distributions import two_hot_loss
 from wpt_agents.model.layers import frozen
-from wpt_agents.model.policy import IMAGE_SPACE, WPTPolicy
+from wpt_agents.model.observations import IMAGE_SPACE
+from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training.model_files import optimizers

@@ -9,8 +9,8 @@ from wpt_agents.model.observations import to_images
 
 def test_colour_images_pass_unchanged_with_their_channels_first_or_last():
     image = noise(2)
-    for given in (image, image.transpose(0, 3, 1, 2)):
-        images, batched = to_images(given)
+    for passed in (image, image.transpose(0, 3, 1, 2)):
+        images, batched = to_images(passed)
         assert batched and np.array_equal(images, image)
     single, batched = to_images(image[0])
     assert not batched and np.array_equal(single, image[:1])
@@ -21,8 +21,8 @@ def test_grayscale_is_repeated_and_transparency_left_out():
     gray, _ = to_images(image[..., :1])
     assert np.array_equal(gray, np.repeat(image[..., :1], 3, -1))
     rgba = np.concatenate([image, image[..., :1]], -1)
-    for given in (rgba, rgba.transpose(0, 3, 1, 2)):
-        assert np.array_equal(to_images(given)[0], image)
+    for passed in (rgba, rgba.transpose(0, 3, 1, 2)):
+        assert np.array_equal(to_images(passed)[0], image)
 
 
 def test_the_image_of_a_dictionary_is_found_or_chosen():

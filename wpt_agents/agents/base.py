@@ -36,7 +36,7 @@ from torch import Tensor
 
 from wpt_agents.agents.saved import SavedAgent
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.policy import to_images
+from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.rollout import Rollout, Window, last_images, step_all

@@ -20,9 +20,11 @@ from torch import Generator, Tensor, nn
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Batch, Trajectory
-from wpt_agents.model.networks import Encoder, Linear, LinearNorm, Size, frozen
+from wpt_agents.model.images import Encoder
+from wpt_agents.model.layers import Linear, LinearNorm, frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent
+from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner, Metrics
 from wpt_agents.training.randomness import Purpose

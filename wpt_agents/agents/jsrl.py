@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Policy
-from wpt_agents.model.policy import PriorPolicy, prior_action
+from wpt_agents.model.prior_policy import PriorPolicy, prior_action
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.keywords import Stage, amount, choice, count

@@ -21,7 +21,7 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.model_file import read_model
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.actions import space_as_dict, space_from_dict
-from wpt_agents.model.policy import IMAGE_SPACE
+from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
 from wpt_agents.training.environments import as_vec_env

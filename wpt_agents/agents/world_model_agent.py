@@ -18,8 +18,10 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.fast.compiled import compile_loops
+from wpt_agents.model.observations import State
 from wpt_agents.model.ops import definitions
-from wpt_agents.model.policy import PriorPolicy, State, WPTPolicy
+from wpt_agents.model.policy import WPTPolicy
+from wpt_agents.model.prior_policy import PriorPolicy
 from wpt_agents.model.sizes import find_size
 from wpt_agents.training.checks import check_dataset, check_trajectory
 from wpt_agents.training.hyperparameters import Hyperparameters

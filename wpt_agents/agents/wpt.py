@@ -24,7 +24,7 @@ from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
 from wpt_agents.files.model_file import read_model
-from wpt_agents.model.policy import prior_action
+from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.model.sizes import Size
 from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone

@@ -17,8 +17,8 @@ def to_bounds(action: np.ndarray, space: spaces.Box) -> np.ndarray:
     whole = np.issubdtype(space.dtype, np.integer)
     if whole:  # in int8, 127 - (-128) would overflow
         low, high = low.astype(np.float64), high.astype(np.float64)
-    own = action[:, : len(low)].clip(-1, 1)
-    action = low + 0.5 * (own + 1) * (high - low)
+    action = action[:, : len(low)].clip(-1, 1)
+    action = low + 0.5 * (action + 1) * (high - low)
     if whole:  # cutting off the fraction would reach the highest value at 1.0 alone
         action = np.rint(action)
     return action.clip(low, high).astype(space.dtype)  # rounding may overstep
@@ -29,8 +29,8 @@ def space_as_dict(space: spaces.Box) -> dict[str, Any]:
     return {"low": space.low.tolist(), "high": space.high.tolist(), "dtype": space.dtype.name}
 
 
-def space_from_dict(about: Mapping[str, Any]) -> spaces.Box:
+def space_from_dict(fields: Mapping[str, Any]) -> spaces.Box:
     """Make the Box that `space_as_dict` described; files of version 0.1 hold no dtype."""
-    dtype = np.dtype(about.get("dtype", "float32"))
-    low, high = np.array(about["low"], dtype), np.array(about["high"], dtype)
+    dtype = np.dtype(fields.get("dtype", "float32"))
+    low, high = np.array(fields["low"], dtype), np.array(fields["high"], dtype)
     return spaces.Box(low, high, dtype=dtype.type)

@@ -11,8 +11,7 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import IMAGE_SIZE
 from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.observations import Observation, to_images
-from wpt_agents.model.policy import State, stack_frames
+from wpt_agents.model.observations import Observation, State, stack_frames, to_images
 from wpt_agents.model.sizes import Size
 
 

@@ -4,11 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from wpt_agents.data.images import resized
 from wpt_agents.data.trajectory import IMAGE_SIZE
+from wpt_agents.model.behavior_cloning import FRAMES
 
+IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
 Observation = np.ndarray | Mapping[str, np.ndarray]
+State = tuple[np.ndarray, ...]  # the recurrent state of acting, which the caller keeps
 CHANNELS = {1: "grayscale", 3: "colour", 4: "RGBA"}
 
 
@@ -126,3 +130,21 @@ def check_state(state: Any, shapes: tuple[tuple[int, ...], ...], n: int) -> None
             f"The state is of {lengths.pop()} environments, the observation of {n}: pass "
             "state=None where all episodes begin"
         )
+
+
+def stack_frames(
+    image: np.ndarray, frames: np.ndarray | None, episode_start: np.ndarray | None
+) -> np.ndarray:
+    """Return the last three images of n episodes, repeating the first one where an episode begins.
+
+    :param image: (n, 64, 64, 3), the newest
+    :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
+    :param episode_start: (n,) bool
+    """
+    if frames is None:
+        return np.repeat(image[:, None], FRAMES, 1)
+    check_state((frames,), ((FRAMES, *image.shape[1:]),), len(image))
+    first = check_episode_start(episode_start, len(image))
+    moved: np.ndarray = np.concatenate([frames[:, 1:], image[:, None]], 1)
+    moved[first] = image[first, None]
+    return moved

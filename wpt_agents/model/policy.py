@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -10,14 +10,15 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
-from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory, led_to, stack_windows
+from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.actor_critic import Actor, Critic
-from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.model.behavior_cloning import PriorActor
 from wpt_agents.model.distributions import Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
     Observation,
+    State,
     check_episode_start,
     check_state,
     to_images,
@@ -26,9 +27,6 @@ from wpt_agents.model.ops import op
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.sizes import Size
 from wpt_agents.model.world_model import WorldModel, world_model_update_loss
-
-IMAGE_SPACE = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-State = tuple[np.ndarray, ...]
 
 
 class Dream(NamedTuple):
@@ -288,62 +286,3 @@ def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = N
     states, action = policy.world_model.rssm.imagine(start, act, horizon, generator)
     share = torch.stack(saturated).mean() / policy.action_mask.sum()
     return Dream(states, action, torch.stack(entropies, 1), share)
-
-
-class HasClone(Protocol):
-    """A policy with a prior actor."""
-
-    prior_actor: PriorActor
-    action_mask: Tensor  # (A,) bool, True at the entries of an action that the robot has
-
-    @property
-    def device(self) -> torch.device:
-        """Where the weights are."""
-
-    def to_env(self, action: np.ndarray) -> np.ndarray:
-        """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's actions."""
-
-
-class PriorPolicy:
-    """The prior actor with SB3's `predict`; its state is the last three images."""
-
-    def __init__(self, policy: HasClone) -> None:
-        self.policy = policy
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """Act as `WPTPolicy.predict`; the clone is deterministic in any case."""
-        images, batched = to_images(observation)
-        frames = stack_frames(images, state[0] if state else None, episode_start)
-        action = self.policy.to_env(prior_action(self.policy, frames))
-        return (action if batched else action[0]), (frames,)
-
-
-def stack_frames(
-    image: np.ndarray, frames: np.ndarray | None, episode_start: np.ndarray | None
-) -> np.ndarray:
-    """Return the last three images of n episodes, repeating the first one where an episode begins.
-
-    :param image: (n, 64, 64, 3), the newest
-    :param frames: (n, F, 64, 64, 3), as returned at the step before, or None
-    :param episode_start: (n,) bool
-    """
-    if frames is None:
-        return np.repeat(image[:, None], FRAMES, 1)
-    check_state((frames,), ((FRAMES, *image.shape[1:]),), len(image))
-    first = check_episode_start(episode_start, len(image))
-    moved: np.ndarray = np.concatenate([frames[:, 1:], image[:, None]], 1)
-    moved[first] = image[first, None]
-    return moved
-
-
-@torch.no_grad()
-def prior_action(policy: HasClone, frames: np.ndarray) -> np.ndarray:
-    """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
-    images = torch.from_numpy(frames).to(policy.device)
-    return np.asarray(policy.prior_actor.act(images, policy.action_mask).cpu())

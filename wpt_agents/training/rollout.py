@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.policy import State, stack_frames, to_images
+from wpt_agents.model.observations import State, stack_frames, to_images
 from wpt_agents.training.environments import last_observation
 
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode

@@ -7,11 +7,11 @@ from pathlib import Path
 # and from the folders below it; tests/test_architecture.py checks this.
 LAYERS = [
     ("zoo", "runs agents", "command line, presets, collecting, engines, evaluation, report, bench"),
-    ("agents", "one algorithm per file", "WPT (Algorithm 1), curious agents that collect data"),
+    ("agents", "one algorithm per file", "WPT (Algorithm 1), DrQ-v2, RLPD, JSRL, R3M, PackNet, curious agents"),
     (
         "training",
         "how an agent learns",
-        "updates, pre-training, rollouts, guidance, checks, many GPUs",
+        "learner, keywords, pre-training, rollouts, guidance, many GPUs",
     ),
     ("fast", "the same functions, faster", "twins of definitions for a CPU or a GPU"),
     (

@@ -7,7 +7,11 @@ from pathlib import Path
 # and from the folders below it; tests/test_architecture.py checks this.
 LAYERS = [
     ("zoo", "runs agents", "command line, presets, collecting, engines, evaluation, report, bench"),
-    ("agents", "one algorithm per file", "WPT (Algorithm 1), DrQ-v2, RLPD, JSRL, R3M, PackNet, curious agents"),
+    (
+        "agents",
+        "one algorithm per file",
+        "WPT (Algorithm 1), DrQ-v2, RLPD, JSRL, R3M, PackNet, curiosity",
+    ),
     (
         "training",
         "how an agent learns",

@@ -96,6 +96,18 @@ def test_the_readme_is_short():
     assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 26
 
 
+def test_the_readme_uses_public_names_only():
+    modules = [
+        (node.module, [alias.name for alias in node.names])
+        for code in blocks(README)
+        for node in ast.walk(ast.parse(code))
+        if isinstance(node, ast.ImportFrom)
+    ]
+    assert modules
+    for module, names in modules:
+        assert module == "wpt_agents" and set(names) <= set(wpt_agents.__all__)
+
+
 def test_the_examples_keywords_are_those_of_the_demo():
     demo = load_preset("metaworld", "demo")
     assert demo.env.rendering in EXAMPLE and demo.collect.behaviour in EXAMPLE

@@ -20,6 +20,7 @@ from typer.main import get_command
 from wpt_envs import dmc
 from wpt_envs.tasks import TASKS
 
+import wpt_agents
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.methods import METHODS

@@ -211,7 +211,7 @@ def test_images_may_come_channels_first(env):
 @pytest.mark.parametrize("size", [48, 100])
 def test_images_of_another_size_are_resized_and_it_says_so(size):
     env = DotEnv(size=size)
-    with pytest.warns(UserWarning, match=rf"\({size}, {size}, 3\) are resized to \(64, 64, 3\)"):
+    with pytest.warns(UserWarning, match=rf"Images of {size} x {size} are resized to 64 x 64"):
         model = agent(env)
     model.learn(LENGTH)
     evaluate_policy(model, env, 1, warn=False)

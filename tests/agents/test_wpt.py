@@ -387,24 +387,6 @@ def test_the_head_start_is_made_at_once_and_what_was_earned_counts_towards_it():
     assert model.updates == 13
 
 
-def test_the_rates_of_actor_and_critic_fall_over_a_call_of_learn():
-    rates = []
-    model = agent(ClockEnv(length=7), actor_critic_decay=True, learning_starts=7, train_ratio=4)
-    model.actor_critic_learning_rate = 0.1
-
-    class Note(BaseCallback):
-        def _on_step(self):
-            optimizers = model.learner.actor_optimizer, model.learner.critic_optimizer
-            rates.append([o.param_groups[0]["lr"] for o in optimizers])
-            return True
-
-    model.learn(28, callback=Note())
-    assert rates[6] == pytest.approx([0.1, 0.1])  # before the first update
-    # the updates after step 7 use 1 - 7 / 28 of it, those after step 21 a quarter
-    assert rates[7] == pytest.approx([0.075, 0.075])
-    assert rates[-1] == pytest.approx([0.025, 0.025])
-
-
 def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):
     rates = []
     model = pretrained(store, env=DotEnv(), guidance=1, bc_steps=4, bc_learning_rate=0.1)

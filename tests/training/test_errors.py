@@ -104,7 +104,9 @@ def test_a_dataset_of_other_images_is_refused(tmp_path):
     other = Trajectory(np.zeros((9, 84, 84, 3), np.uint8), np.zeros((8, 2)))
     with TrajectoryDataset.create(tmp_path / "data", image_size=84) as dataset:
         dataset.append(other)
-    refused(dataset, "images of 84 pixels, WPT takes 64: resize")
+    refused(dataset, r"images of 84 pixels, .* copy, TrajectoryDataset\.merge\('NEW', .*size=64\)")
+    with pytest.warns(UserWarning, match="84 x 84 are resized to 64 x 64"):
+        pretrained(TrajectoryDataset.merge(tmp_path / "new", [dataset.path], image_size=64))
     with pytest.warns(UserWarning, match="84 x 84 are resized to 64 x 64"):
         pretrained([other])
 

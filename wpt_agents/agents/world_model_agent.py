@@ -17,6 +17,7 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.units import compare_units
 from wpt_agents.fast.compiled import compile_loops
 from wpt_agents.model.observations import State
 from wpt_agents.model.ops import definitions
@@ -117,6 +118,8 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def check_env(self, env: VecEnv) -> None:
         """Refuse an environment that WPT cannot act in."""
         check_spaces(env, self.hyperparameters.max_action_dim)
+        if self.dataset is not None and isinstance(env.action_space, spaces.Box):
+            compare_units(self.dataset, env.action_space, self.hyperparameters.embodiment)
 
     def on_other_actions(self) -> None:
         """Begin a new task if one was begun: its episodes and behaviour have another width."""

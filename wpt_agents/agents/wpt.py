@@ -23,6 +23,7 @@ from wpt_agents.agents.base import Metrics
 from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
+from wpt_agents.data.units import in_units_of
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.model.sizes import Size
@@ -199,7 +200,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             )
             progress.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
-        for trajectory in self.dataset.subset(progress.retrieved_ids):
+        chosen = self.dataset.subset(progress.retrieved_ids)
+        for trajectory in in_units_of(chosen, self.action_space):
             self.retrieved.add(replace(trajectory, reward=None))
 
     def clone(self, progress_bar: bool = False) -> None:
@@ -257,9 +259,6 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.streams.numpy(Purpose.UPDATE, progress.updates),
             settings.recent_share,
         ).to(self.device)
-        if settings.actor_critic_decay:
-            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
         head_start = progress.task_updates < settings.actor_delay
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:

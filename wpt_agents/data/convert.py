@@ -10,22 +10,27 @@ import shutil
 import sys
 import tempfile
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
+import torch
 from stable_baselines3.common.buffers import ReplayBuffer as SB3Buffer
+from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.data.dataset import Source, TrajectoryDataset
 from wpt_agents.data.importers.episodes import Episodes
-from wpt_agents.data.importers.formats import FORMATS, open_episodes, recognise
-from wpt_agents.data.importers.minari import local_minari
+from wpt_agents.data.importers.formats import FORMATS, NAMES, open_episodes, recognise
+from wpt_agents.data.importers.minari import MinariEpisodes, local_minari
+from wpt_agents.data.importers.recognise import refusal
 from wpt_agents.data.importers.sb3 import SB3Episodes
 from wpt_agents.data.index import CONVERT_LOCK
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.units import Ranges
 from wpt_agents.files.locks import locked
 
 One = Source | TrajectoryDataset | SB3Buffer | ReplayBuffer | Episodes | Trajectory
@@ -53,10 +58,59 @@ def open_dataset(data: Data) -> TrajectoryDataset:
         return _stored(data.trajectories)
     if isinstance(data, Trajectory):
         return _stored([data])
-    items = list(data) if isinstance(data, Sequence) else data
-    if isinstance(items, list) and any(not isinstance(item, Trajectory) for item in items):
-        return TrajectoryDataset.join([open_dataset(item) for item in items])
-    return _stored(cast(Iterable[Trajectory], items))
+    module = type(data).__module__.split(".")[0]
+    if module == "minari":
+        return _stored(MinariEpisodes(data))
+    if module == "lerobot" and hasattr(data, "root"):
+        return _open_path(data.root)
+    if isinstance(data, Episodes) or not isinstance(data, Sequence):
+        return _stored(_checked(data))
+    if not data:
+        raise ValueError("The dataset is an empty list; give trajectories, datasets or paths")
+    if all(isinstance(item, Trajectory) for item in data):
+        return _stored(cast(Sequence[Trajectory], data))
+    refuse_object(data)
+    return TrajectoryDataset.join([open_dataset(item) for item in data])
+
+
+def _checked(data: Any) -> Iterator[Trajectory]:
+    """The trajectories of an iterable; anything else in it, or in its place, is refused."""
+    refuse_object(data)
+    for i, item in enumerate(data):
+        if not isinstance(item, Trajectory):
+            raise ValueError(
+                f"Item {i} of the {type(data).__name__} is a {type(item).__name__}; an iterable "
+                "that is taken for a dataset must yield Trajectory(image, action)"
+            )
+        yield item
+
+
+def refuse_object(data: Any) -> None:
+    """Refuse objects that are no dataset by what they are, with the remedy.
+
+    :raises ValueError: it is one of them
+    """
+    kind = type(data).__name__
+    make = "make Trajectory(image, action) of each episode and give their list"
+    if isinstance(data, Mapping):
+        raise ValueError(f"A dictionary ({', '.join(map(str, data))}) is no dataset; {make}")
+    if isinstance(data, np.ndarray | torch.Tensor):
+        raise ValueError(
+            f"An array of {tuple(data.shape)} is no dataset: it has images or actions alone; {make}"
+        )
+    if isinstance(data, Sequence) and any(
+        isinstance(item, np.ndarray | torch.Tensor) for item in data
+    ):
+        raise ValueError(f"A {kind} of arrays is no dataset; {make}")
+    if isinstance(data, gym.Env | VecEnv):
+        raise ValueError(
+            f"An environment ({kind}) is no dataset: give it as env=, and as dataset= the data"
+        )
+    if isinstance(data, bytes) or not isinstance(data, Iterable):
+        raise ValueError(
+            f"An object of type {kind} is no dataset; give a TrajectoryDataset, a path, "
+            "trajectories, a replay buffer, or a list of these"
+        )
 
 
 def _stored(trajectories: Iterable[Trajectory]) -> TrajectoryDataset:
@@ -71,8 +125,10 @@ def _stored(trajectories: Iterable[Trajectory]) -> TrajectoryDataset:
 def _open_path(source: Source) -> TrajectoryDataset:
     source = os.path.expanduser(source)
     form = recognise(source)
-    if form is None:
+    if form is None and (Path(source) / "meta.json").exists():
         return TrajectoryDataset.open(source)
+    if form is None:
+        raise refusal(source, NAMES)
     folder = cache_folder(source)
     # Of several processes that start at once, one converts; the others wait and find it done.
     with locked(folder / CONVERT_LOCK):
@@ -105,10 +161,14 @@ def from_episodes(
         mininterval=0.2 if sys.stderr.isatty() else 10,
         disable=not progress_bar or done == len(episodes),
     )
+    ranges = Ranges()
     with dataset, bar:
         for i in range(done, len(episodes)):
-            dataset.append(episodes[i])
+            trajectory = episodes[i]
+            dataset.append(trajectory)
+            ranges.add(trajectory)
             bar.update()
+    ranges.warn(episodes.name)
     return dataset
 
 

@@ -50,8 +50,11 @@ class TrajectoryDataset(StoredTrajectories):
     from_lerobot: ClassVar[Door]
     from_minari: ClassVar[Door]
     from_npz: ClassVar[Door]
+    from_official: ClassVar[Door]
     from_rlds: ClassVar[Door]
     from_sb3: ClassVar[Door]
+    from_tdmpc2: ClassVar[Door]
+    from_zarr: ClassVar[Door]
 
     def __init__(
         self,

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from wpt_agents.data.index import Entry, Meta
 from wpt_agents.data.shards import BLOCK, read_steps
 from wpt_agents.data.trajectory import Trajectory
@@ -41,5 +43,6 @@ class Folder(NamedTuple):
             embodiment=entry.embodiment,
             task=entry.task,
             source=entry.source,
+            bounds=None if entry.bounds is None else np.array(entry.bounds),
         )
         return part, start, stop

@@ -38,6 +38,7 @@ class Entry:
 
     :param blocks: the blocks' sizes in bytes, in words: parsing 60,000 lists would take a second
     :param checksum: CRC-32 of the blocks' own; None in datasets written before it was there
+    :param bounds: lowest and highest values of the actions in the robot's own units, if known
     """
 
     shard: int
@@ -51,6 +52,7 @@ class Entry:
     task: str | None = None
     source: str | None = None
     checksum: int | None = None
+    bounds: list[list[float]] | None = None
 
     @property
     def place(self) -> Place:

@@ -87,6 +87,11 @@ class StoredTrajectories:
         return [entry.source for entry in self._entries]
 
     @property
+    def bounds(self) -> list[list[list[float]] | None]:
+        """What -1 and 1 stand for in each trajectory, [lowest, highest]; None where unknown."""
+        return [entry.bounds for entry in self._entries]
+
+    @property
     def max_action_dim(self) -> int:
         """The widest embodiment's action width, 0 without trajectories."""
         return max((entry.action_dim for entry in self._entries), default=0)

@@ -137,6 +137,7 @@ class Writer:
             embodiment=trajectory.embodiment,
             task=trajectory.task,
             source=trajectory.source,
+            bounds=None if trajectory.bounds is None else trajectory.bounds.tolist(),
         )
         return self._add(_encode(trajectory, self._meta), labels)
 

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 IMAGE_SIZE = 64
+TOLERANCE = 1e-5  # by which an action may overstep a limit, from rounding
 STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
 
 
@@ -34,10 +35,12 @@ class Trajectory:
     :param action: (T, A) float32 in [-1, 1], as wide as the embodiment or padded with zeros
     :param reward: (T,) float32, None in reward-free data
     :param terminated: whether the last image is a terminal state (a time limit is not)
-    :param action_dim: the embodiment's true action width; A when not given
-    :param embodiment: the robot's name, when known
-    :param task: what the behaviour was after, when known
+    :param action_dim: the embodiment's true action width; A by default
+    :param embodiment: the robot's name, if known
+    :param task: the task of the behaviour, if known
     :param source: where the trajectory comes from, in words
+    :param bounds: (2, action_dim), the values in the robot's own units that -1 and 1 stand for;
+        None where that is not known
     :raises ValueError: a wrong shape or dtype, NaN or infinity, an action outside [-1, 1]
     """
 
@@ -49,6 +52,7 @@ class Trajectory:
     embodiment: str | None = None
     task: str | None = None
     source: str | None = None
+    bounds: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         image, action, reward = self.image, self.action, self.reward
@@ -64,8 +68,7 @@ class Trajectory:
                 f"Trajectory.action must be (T, A) with T = {len(image) - 1} >= 1 for "
                 f"{len(image)} images, got {action.shape}"
             )
-        if not np.isfinite(action).all() or np.abs(action).max() > 1 + 1e-5:
-            raise ValueError("Trajectory.action must be finite and in [-1, 1]; rescale it")
+        check_range(action)
         if reward is not None and (reward.shape != (len(action),) or not np.isfinite(reward).all()):
             raise ValueError(
                 f"Trajectory.reward must be finite and of shape ({len(action)},), got "
@@ -75,6 +78,14 @@ class Trajectory:
             raise ValueError(f"action_dim {self.action_dim} exceeds the width {action.shape[1]}")
         object.__setattr__(self, "action", np.asarray(action, np.float32))
         object.__setattr__(self, "action_dim", int(self.action_dim) or action.shape[1])
+        if self.bounds is not None:
+            bounds = np.asarray(self.bounds, np.float64)
+            if bounds.shape != (2, self.action_dim):
+                raise ValueError(
+                    f"Trajectory.bounds must be (2, {self.action_dim}), lowest and highest value "
+                    f"of each action, got {bounds.shape}"
+                )
+            object.__setattr__(self, "bounds", bounds)
         object.__setattr__(self, "terminated", bool(self.terminated))
         object.__setattr__(self, "reward", reward)
 
@@ -83,10 +94,34 @@ class Trajectory:
         return len(self.action)
 
     def __repr__(self) -> str:
-        """What it is of, without its pixels."""
+        """A summary without the pixels."""
         names = f"embodiment={self.embodiment!r}, task={self.task!r}"
         rewards = "known" if self.reward is not None else None
         return f"Trajectory(T={len(self)}, {names}, action_dim={self.action_dim}, reward={rewards})"
+
+
+def check_range(action: np.ndarray) -> None:
+    """Refuse actions outside [-1, 1], with the range that was found and the remedy.
+
+    :param action: (T, A)
+    :raises ValueError: an action that is not finite, or is outside [-1, 1]
+    """
+    if not np.isfinite(action).all():
+        t, i = np.argwhere(~np.isfinite(action))[0]
+        raise ValueError(
+            f"Trajectory.action must be finite and in [-1, 1], but action {t} is {action[t, i]} in "
+            f"dimension {i}; leave that episode out"
+        )
+    if np.abs(action).max() > 1 + TOLERANCE:
+        least, most = action.min(0), action.max(0)
+        i = int(np.argmax(np.maximum(-least, most)))
+        low, high = (",".join(f"{x:.4g}" for x in row) for row in (least, most))
+        raise ValueError(
+            f"Trajectory.action must be in [-1, 1], but dimension {i} runs from {least[i]:.4g} to "
+            f"{most[i]:.4g}: rescale it, 2 * (action - low) / (high - low) - 1, by the low and "
+            f"high of the environment's action space. An importer does that by low=[{low}], "
+            f"high=[{high}], or wider (--low={low} --high={high})"
+        )
 
 
 @dataclass(frozen=True)
@@ -113,7 +148,7 @@ class Batch:
         assert len(set(shapes.values())) == 1, shapes
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch on `device`; from pinned memory the copy runs beside the computation."""
+        """The same batch on `device`; a copy from pinned memory runs beside the computation."""
         pinned = self.image.is_pinned()
         return Batch(
             **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)}

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from wpt_agents.data.images import resize_message
 from wpt_agents.data.trajectory import IMAGE_SIZE
 from wpt_agents.model.observations import CHANNELS, channel_axis
 
@@ -53,7 +54,7 @@ def check_observations(env: VecEnv) -> None:
         warnings.warn(f"{CHANNELS[shape[axis]]} observations, {shape}, are {how}", stacklevel=4)
     height, width = (shape[0], shape[1]) if axis == 2 else (shape[1], shape[2])
     if (height, width) != (IMAGE_SIZE, IMAGE_SIZE):
-        warnings.warn(f"Observations of {shape} are resized to {IMAGE_SHAPE}", stacklevel=4)
+        warnings.warn(resize_message(height, width, IMAGE_SIZE), stacklevel=4)
 
 
 def is_image(space: spaces.Space, channels: int | None = None) -> bool:

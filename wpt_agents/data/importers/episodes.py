@@ -2,26 +2,39 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from wpt_agents.data.images import resized
+from wpt_agents.data.images import Resizer
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
+from wpt_agents.data.units import both_limits, rescaled
 
 
 class Episodes(ABC):
-    """Somebody's episodes in a fixed order, each read and converted when asked for.
+    """Episodes in a fixed order, each read and converted when it is asked for.
 
-    One of a single image holds no action and is left out, aloud.
+    An episode of a single image holds no action and is left out with a warning.
 
     :param image_size: height and width to resize to
     :param rewards: whether to keep the rewards; pre-training needs none
-    :param embodiment: the robot's name, for all
-    :param task: what the behaviour was after, for all
+    :param embodiment: the robot's name, for all episodes
+    :param task: the task, for all episodes
+    :param image_key: the name of the images (or camera), if the format's own is not there or there
+        are several
+    :param action_key: the name of the actions, or several names whose arrays are concatenated in
+        that order; in a string, they are separated by commas
+    :param done_key: the name of the flags at which an episode ends, or of the flag that its end is
+        a terminal state where the format itself separates episodes
+    :param low: (A,) or one number: the actions' lowest values, if they are not in [-1, 1]
+    :param high: (A,) or one number: their highest values
+    :param crop: cut out the middle square of images that are not square, instead of squeezing them
+    :ivar name: where the data come from, for messages
     """
+
+    name = "The data"
 
     def __init__(
         self,
@@ -29,9 +42,23 @@ class Episodes(ABC):
         rewards: bool = False,
         embodiment: str | None = None,
         task: str | None = None,
+        image_key: str | None = None,
+        action_key: str | Sequence[str] | None = None,
+        done_key: str | None = None,
+        low: float | Sequence[float] | np.ndarray | None = None,
+        high: float | Sequence[float] | np.ndarray | None = None,
+        crop: bool = False,
     ) -> None:
-        self.image_size, self.rewards = image_size, rewards
-        self.embodiment, self.task = embodiment, task
+        self.image_size = image_size
+        self.rewards = rewards
+        self.embodiment = embodiment
+        self.task = task
+        self.image_key = image_key
+        self.action_keys = as_keys(action_key)
+        self.done_key = done_key
+        self.limits = both_limits(low, high)
+        self._resize = Resizer(image_size, crop, "crop=True (--crop)")
+        self._warned_of_clipping = False
 
     @abstractmethod
     def __len__(self) -> int:
@@ -53,23 +80,68 @@ class Episodes(ABC):
         action: np.ndarray,
         reward: np.ndarray | None,
         source: str,
+        limits: tuple[np.ndarray, np.ndarray] | None = None,
         **labels: Any,
     ) -> Trajectory:
-        """Checks and converts; time is the caller's: (T + 1, ...), (T, A) and (T,)."""
+        """Check and convert an episode in our timing: (T + 1, ...), (T, A) and (T,).
+
+        :param limits: of the actions, by the format; the user's have precedence
+        """
         try:
+            action = as_actions(action)
+            limits = self._limits_of(action) or limits
+            if limits is not None:
+                self._check_limits(action, *limits)
             return Trajectory(
-                image=as_images(image, self.image_size),
-                action=np.ascontiguousarray(action, np.float32),
+                image=as_images(image, self._resize),
+                action=action if limits is None else rescaled(action, *limits),
                 reward=None if reward is None or not self.rewards else np.ravel(reward),
                 source=source,
+                bounds=None if limits is None else np.stack(limits),
                 **{"embodiment": self.embodiment, "task": self.task, **labels},
             )
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from error
 
+    def _limits_of(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """The user's limits, one for each dimension of `action`; None if there are none."""
+        if self.limits is None:
+            return None
+        width = action.shape[1]
+        low, high = (np.repeat(x, width) if x.shape == (1,) else x for x in self.limits)
+        return low, high
+
+    def _check_limits(self, action: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+        """Warn once if actions lie outside the limits: they are clipped."""
+        if self._warned_of_clipping or action.shape[1:] != low.shape or low.shape != high.shape:
+            return
+        slack = 1e-3 * (high - low)
+        outside = ((action < low - slack) | (action > high + slack)).any(0)
+        if outside.any():
+            self._warned_of_clipping = True
+            i = int(np.flatnonzero(outside)[0])
+            warnings.warn(
+                f"{self.name}: actions in dimension {i} run from {action[:, i].min():.4g} to "
+                f"{action[:, i].max():.4g}, beyond the limits {low[i]:.4g} to {high[i]:.4g}, and "
+                "are clipped to them",
+                stacklevel=5,
+            )
+
+    def _refuse_done_key(self, form: str) -> None:
+        if self.done_key is not None:
+            raise ValueError(f"{form} stores where episodes end; leave done_key out")
+
+
+def as_keys(names: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Names of arrays as a tuple; a string may hold several, separated by commas."""
+    if names is None:
+        return ()
+    parts = names.split(",") if isinstance(names, str) else names
+    return tuple(part.strip() for part in parts)
+
 
 def warn_left_out(count: int, source: object) -> None:
-    """Says how many episodes of a single image a reader leaves out."""
+    """Say how many episodes of a single image a reader leaves out."""
     if count:
         warnings.warn(
             f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, for want of "
@@ -79,7 +151,7 @@ def warn_left_out(count: int, source: object) -> None:
 
 
 def needs(module: str, what: str) -> Any:
-    """Imports an optional package, or says how to get it."""
+    """Import an optional package, or say how to get it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -87,56 +159,72 @@ def needs(module: str, what: str) -> Any:
         raise ImportError(f"Reading {what} needs {package}: pip install {package}") from error
 
 
-def as_images(image: np.ndarray, size: int) -> np.ndarray:
+def as_actions(action: np.ndarray) -> np.ndarray:
+    """Actions as (T, A) floats.
+
+    :raises ValueError: anything that is not an array of continuous actions
+    """
+    action = np.asarray(action)
+    if action.ndim == 1 and action.dtype.kind in "iub":
+        raise ValueError(
+            f"the action of a step is one whole number ({action.dtype}), as of discrete actions; "
+            "WPT takes continuous ones, (T, A)"
+        )
+    if action.ndim == 1:
+        action = action[:, None]  # a single actuator
+    if action.ndim != 2 or action.dtype.kind not in "fiub":
+        raise ValueError(f"actions must be numbers (T, A), got {action.shape} {action.dtype}")
+    return np.ascontiguousarray(action, np.float32 if action.dtype == np.float32 else np.float64)
+
+
+def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
     """Colour images, channels first or last, resized; of stacked frames, the newest.
 
-    :param image: (N, H, W, 3 k) or (N, 3 k, H, W) uint8
-    :return: (N, size, size, 3) uint8; not square is squeezed
+    :param image: (N, H, W, 3 k) or (N, 3 k, H, W) uint8, or whole numbers 0 .. 255 as floats
+    :return: (N, S, S, 3) uint8
+    :raises ValueError: anything else; names shape, dtype or range, and the remedy
     """
-    if image.ndim != 4 or image.dtype != np.uint8:
+    image = np.asarray(image)
+    if image.ndim == 3 and image.dtype == np.uint8:
+        raise ValueError(
+            f"the images are {image.shape} without a channel axis: grayscale? Repeat them, "
+            "np.repeat(image[..., None], 3, axis=-1)"
+        )
+    if image.ndim != 4:
         raise ValueError(
             f"the observations are {image.shape} {image.dtype}, not (N, H, W, 3) uint8 images; "
-            "name the images' key, or render the states first"
+            "name the images' key, image_key (--image-key), or render the states first"
         )
     if image.shape[1] < min(image.shape[2:]):
         image = image.transpose(0, 2, 3, 1)
-    if image.shape[-1] % 3:
-        raise ValueError(f"the images have {image.shape[-1]} channels, colour needs 3")
-    image = image[..., -3:]
-    if image.shape[1:3] == (size, size):
-        return np.ascontiguousarray(image)
-    return np.concatenate([resized(image[at : at + 64], size) for at in range(0, len(image), 64)])
+    _check_channels(image)
+    return resize(_as_bytes(image)[..., -3:])
 
 
-def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """The actions' limits as arrays, None where neither is given.
+def _check_channels(image: np.ndarray) -> None:
+    channels = image.shape[-1]
+    if channels % 3 == 0:
+        return
+    problem = f"the images have {channels} channels ({image.shape}), colour needs 3"
+    remedies = {
+        1: "grayscale? Repeat it, np.repeat(image, 3, axis=-1)",
+        2: "grayscale with alpha? Take np.repeat(image[..., :1], 3, axis=-1)",
+        4: "RGBA? Drop the alpha channel, image[..., :3]",
+    }
+    other = "the axes must be (N, H, W, 3) or (N, 3, H, W)"
+    raise ValueError(f"{problem}: {remedies.get(channels, other)}")
 
-    :raises ValueError: one without the other
-    """
-    if low is None and high is None:
-        return None
-    if low is None or high is None:
-        raise ValueError(
-            f"low and high, the actions' limits, belong together; got low={low} and high={high}"
-        )
-    return np.asarray(low, np.float64), np.asarray(high, np.float64)
 
-
-def rescaled(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Actions of the range `low` to `high`, clipped to it, in [-1, 1]; 0 where both are equal.
-
-    :param action: (T, A)
-    :param low: (A,)
-    :param high: (A,)
-    """
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    if action.ndim != 2 or action.shape[1:] != low.shape or low.shape != high.shape:
-        raise ValueError(
-            f"actions of {action.shape} with limits of {low.shape} and {high.shape} are not "
-            "continuous actions (T, A) with limits (A,)"
-        )
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ValueError(f"the actions' limits {low} to {high} are not finite; give low and high")
-    width = np.where(high > low, high - low, 1.0)
-    scaled = np.where(high > low, 2 * (action - low) / width - 1, 0.0)
-    return np.clip(scaled, -1, 1).astype(np.float32)
+def _as_bytes(image: np.ndarray) -> np.ndarray:
+    """The images as uint8; floats that are bytes in fact are taken, other floats refused."""
+    if image.dtype == np.uint8:
+        return image
+    least, most = float(image.min()), float(image.max())
+    whole = image.dtype.kind in "fiu" and 0 <= least and 1 < most <= 255
+    if whole and np.array_equal(image, np.rint(image)):
+        return image.astype(np.uint8)  # Diffusion Policy stores bytes as float32
+    scale = "255 * image" if 0 <= least and most <= 1 else "(image - low) / (high - low) * 255"
+    raise ValueError(
+        f"the images are {image.dtype} from {least:.4g} to {most:.4g}, not uint8 from 0 to 255; "
+        f"store np.rint({scale}).astype(np.uint8)"
+    )

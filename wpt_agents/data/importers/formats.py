@@ -2,7 +2,6 @@
 
 import inspect
 import os
-from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -10,11 +9,14 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.hdf5 import Hdf5Episodes
 from wpt_agents.data.importers.lerobot import LeRobotEpisodes
-from wpt_agents.data.importers.minari import MinariEpisodes, local_minari
+from wpt_agents.data.importers.minari import MinariEpisodes
 from wpt_agents.data.importers.npz import NpzEpisodes
-from wpt_agents.data.importers.official import OfficialEpisodes, is_official
+from wpt_agents.data.importers.official import OfficialEpisodes
+from wpt_agents.data.importers.recognise import recognise_path, refusal
 from wpt_agents.data.importers.rlds import RldsEpisodes
 from wpt_agents.data.importers.sb3 import SB3Episodes
+from wpt_agents.data.importers.tdmpc2 import TdMpc2Episodes
+from wpt_agents.data.importers.zarr import ZarrEpisodes
 from wpt_agents.files.names import unknown_name
 
 FORMATS: dict[str, type[Episodes]] = {
@@ -25,7 +27,10 @@ FORMATS: dict[str, type[Episodes]] = {
     "official": OfficialEpisodes,
     "rlds": RldsEpisodes,
     "sb3": SB3Episodes,
+    "tdmpc2": TdMpc2Episodes,
+    "zarr": ZarrEpisodes,
 }
+NAMES = ", ".join(FORMATS)
 Source = str | os.PathLike[str]
 
 
@@ -41,9 +46,7 @@ def open_episodes(
         source = os.path.expanduser(source)
     form = form or recognise(source)
     if form is None:
-        raise ValueError(
-            f"{source} looks like none of: {', '.join(sorted(FORMATS))}; name the format"
-        )
+        raise refusal(os.fspath(source), NAMES)  # type: ignore[arg-type]  # a buffer has a format
     if form not in FORMATS:
         raise unknown_name("format", form, FORMATS)
     own = inspect.signature(FORMATS[form].__init__).parameters
@@ -52,26 +55,12 @@ def open_episodes(
     for name in options:
         if name not in valid:
             raise unknown_name(f"option for {form}", name, valid)
-    return FORMATS[form](source, **options)  # type: ignore[arg-type]
+    episodes = FORMATS[form](source, **options)  # type: ignore[arg-type]
+    if isinstance(source, str):
+        episodes.name = source
+    return episodes
 
 
 def recognise(source: Source | ReplayBuffer) -> str | None:
     """The name in `FORMATS` that a source looks like; None for none, and for our own datasets."""
-    if isinstance(source, ReplayBuffer):
-        return "sb3"
-    path = Path(source)
-    if (path / "meta.json").exists():
-        return None
-    if (path / "meta" / "info.json").exists():
-        return "lerobot"
-    if any((path / part / "metadata.json").exists() for part in ("data", ".")):
-        return "minari"
-    if path.suffix in (".hdf5", ".h5"):
-        return "hdf5"
-    if path.is_dir():
-        if is_official(path):
-            return "official"
-        for pattern, form in (("*.tfrecord*", "rlds"), ("*.npz", "npz")):
-            if next(path.rglob(pattern), None):
-                return form
-    return "minari" if not path.exists() and local_minari(os.fspath(source)).exists() else None
+    return "sb3" if isinstance(source, ReplayBuffer) else recognise_path(source)

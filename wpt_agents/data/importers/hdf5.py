@@ -1,80 +1,64 @@
-"""Flat HDF5 files in D4RL's manner: transitions in a row, episodes end at terminals or timeouts.
+"""HDF5 files of robomimic, LIBERO, mimicgen, ALOHA and ACT, D4RL, V-D4RL, Minari and others.
 
-Action t was taken at observation t. The observation after an episode's last action is there only
-if the file has `next_observations`; without it that action is left out, and no terminal state is
-seen.
+- A group per episode, `data/demo_0/obs/agentview_image` and `data/demo_0/actions`, in numeric
+  order (robomimic and LIBERO), or `traj_0/...` (ManiSkill).
+- A file per episode, `observations/images/<camera>` and `action` (ALOHA and ACT).
+- Flat rows, whose episodes end at `terminals`, `timeouts`, `terminations`, `truncations`, `dones`
+  or `step_type` (D4RL and V-D4RL).
 """
 
-import os
-from itertools import pairwise
+import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+from wpt_agents.data.importers.episodes import needs
+from wpt_agents.data.importers.keys import Table, natural
+from wpt_agents.data.importers.tables import TableEpisodes
 
-from wpt_agents.data.importers.episodes import Episodes, both_limits, needs, rescaled, warn_left_out
-from wpt_agents.data.trajectory import Trajectory
+SUFFIXES = (".hdf5", ".h5", ".he5", ".hdf")
 
 
-class Hdf5Episodes(Episodes):
-    """The episodes of one file; one of a single image is left out.
+class Hdf5Episodes(TableEpisodes):
+    """The episodes of an HDF5 file, or of all in a folder; `TableEpisodes` has the options.
 
-    :param image_key: the images' array; the next ones are at `next_` + it
-    :param low: (A,) the actions' limits, if they are not in [-1, 1]
-    :param high: (A,)
+    A folder is searched for `.hdf5` and `.h5` files.
     """
 
-    def __init__(
-        self,
-        file: str | os.PathLike[str],
-        image_key: str = "observations",
-        low: np.ndarray | None = None,
-        high: np.ndarray | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(**options)
-        self._limits = both_limits(low, high)
+    _handle: Any = None
+
+    def _list(self, path: Path) -> Sequence[Path]:
+        if not path.is_dir():
+            return super()._list(path)
+        files = sorted((f for f in path.rglob("*") if f.suffix in SUFFIXES), key=natural)
+        if not files:
+            raise ValueError(f"{path} holds no HDF5 file ({', '.join(SUFFIXES)})")
+        return files
+
+    def _read(self, file: Path) -> Table:
         h5py = needs("h5py", "HDF5 files")
+        if self._handle is not None:
+            self._handle.close()
         try:
-            self._file = h5py.File(file, "r")
-        except FileNotFoundError:
-            raise ValueError(f"{file} does not exist; name an HDF5 file") from None
+            self._handle = h5py.File(file, "r")
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
-        self._name, self._key = os.fspath(file), image_key
-        missing = {image_key, "actions"} - set(self._file)
-        if missing or not {"terminals", "timeouts"} & set(self._file):
-            raise ValueError(
-                f"{file} needs {image_key!r}, 'actions' and 'terminals' or 'timeouts'; there are: "
-                f"{', '.join(self._file)}"
-            )
-        self._next = f"next_{image_key}" in self._file
-        self._bounds = self._find_bounds()
+        arrays: dict[str, Any] = {}
 
-    def _find_bounds(self) -> list[tuple[int, int]]:
-        """The first row of each episode and one past its last."""
-        rows = len(self._file["actions"])
-        flags = [self._file[k][:] for k in ("terminals", "timeouts") if k in self._file]
-        ends = np.flatnonzero(np.logical_or.reduce([np.ravel(f) for f in flags])) + 1
-        edges = np.unique(np.concatenate([[0], ends, [rows]])).tolist()
-        shortest = 1 if self._next else 2
-        bounds = [(start, stop) for start, stop in pairwise(edges) if stop - start >= shortest]
-        warn_left_out(len(edges) - 1 - len(bounds), self._name)
-        return bounds
+        def add(name: str, node: Any) -> None:
+            if isinstance(node, h5py.Dataset):
+                arrays[name] = node
 
-    def __len__(self) -> int:
-        return len(self._bounds)
+        self._handle.visititems(add)
+        return arrays
 
-    def __getitem__(self, i: int) -> Trajectory:
-        start, stop = self._bounds[i]
-        image, action = self._file[self._key][start:stop], self._file["actions"][start:stop]
-        reward = self._file["rewards"][start:stop] if "rewards" in self._file else None
-        terminated = False
-        if self._next:
-            image = np.concatenate([image, self._file[f"next_{self._key}"][stop - 1 : stop]])
-            terminated = "terminals" in self._file and bool(self._file["terminals"][stop - 1])
-        else:
-            action, reward = action[:-1], None if reward is None else reward[:-1]
-        if self._limits:
-            action = rescaled(action, *self._limits)
-        source = f"{os.path.basename(self._name)} rows {start} to {stop - 1}"
-        return self._trajectory(image, action, reward, source, terminated=terminated)
+    def _task(self, file: Path) -> str | None:
+        """LIBERO's instruction, or the name of robomimic's environment."""
+        attributes = self._handle["data"].attrs if "data" in self._handle else {}
+        for attribute, key in (("problem_info", "language_instruction"), ("env_args", "env_name")):
+            try:
+                told = json.loads(attributes[attribute])[key]
+            except (KeyError, TypeError, ValueError):
+                continue
+            return "".join(told) if isinstance(told, list) else str(told)
+        return None

@@ -8,20 +8,13 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wpt_agents.data.importers.episodes import (
-    Episodes,
-    as_images,
-    both_limits,
-    needs,
-    rescaled,
-    warn_left_out,
-)
+from wpt_agents.data.importers.episodes import Episodes, as_images, needs, warn_left_out
 from wpt_agents.data.trajectory import Trajectory
 
 
@@ -29,42 +22,44 @@ class LeRobotEpisodes(Episodes):
     """A dataset's episodes; actions are rescaled from the limits in its statistics to [-1, 1].
 
     :param folder: with `meta/info.json`
-    :param camera: which camera, if there are several
-    :param low: (A,) the actions' limits, instead of the least and greatest in the data
-    :param high: (A,)
+    :param camera: the camera, if there are several, as `image_key`; its last part is enough
+    :param options: those of `Episodes`; `low` and `high` replace the least and greatest actions in
+        the statistics
     """
 
     def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        camera: str | None = None,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        **options: Any,
+        self, folder: str | os.PathLike[str], camera: str | None = None, **options: Any
     ) -> None:
         super().__init__(**options)
-        given = both_limits(low, high)
+        self._refuse_done_key("LeRobot")
         self._parquet = needs("pyarrow.parquet", "LeRobot datasets")
         self._folder = Path(folder)
         self._info = json.loads(_text(self._folder / "meta" / "info.json"))
         version = str(self._info.get("codebase_version"))
         if not version.startswith("v3."):
             raise ValueError(f"{folder} is of version {version}; convert it to v3.0 with lerobot")
-        self._camera = self._choose(camera)
-        self._low, self._high = given or self._limits()
+        self._camera = self._choose(camera or self.image_key)
+        self._actions = self._choose_actions()
+        self._own_limits = None if self.limits is not None else self._read_limits()
         self._rows = self._episodes()
         self._open: tuple[Path, Any] | None = None
-        if self._info["features"][self._camera]["dtype"] == "video":
+        if self._is_video:
             warnings.warn(
                 f"LeRobot stored the images of {folder} as video, which is lossy; record with "
                 "dtype 'image' to keep them as they were",
                 stacklevel=2,
             )
 
+    @property
+    def _is_video(self) -> bool:
+        return bool(self._info["features"][self._camera]["dtype"] == "video")
+
     def _choose(self, camera: str | None) -> str:
-        features = self._info["features"]
+        features: dict[str, Any] = self._info["features"]
         cameras = [name for name, f in features.items() if f["dtype"] in ("video", "image")]
         chosen = [name for name in cameras if camera in (None, name)]
+        if not chosen and camera is not None:
+            chosen = [name for name in cameras if name.endswith(f".{camera}")]
         if len(chosen) != 1:
             raise ValueError(
                 f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; give one of: "
@@ -72,22 +67,44 @@ class LeRobotEpisodes(Episodes):
             )
         return chosen[0]
 
-    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and greatest actions in the data."""
-        stats = json.loads(_text(self._folder / "meta" / "stats.json"))["action"]
-        return np.asarray(stats["min"], np.float64), np.asarray(stats["max"], np.float64)
+    def _choose_actions(self) -> tuple[str, ...]:
+        features = self._info["features"]
+        missing = [name for name in self.action_keys or ("action",) if name not in features]
+        if missing:
+            similar = [name for name in features if "action" in name]
+            raise ValueError(
+                f"{self._folder} has no feature {missing[0]!r}; give action_key (--action-key), "
+                f"one or several of: {', '.join(similar or features)}"
+            )
+        return self.action_keys or ("action",)
+
+    def _read_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and greatest actions in the data, by its statistics."""
+        path = self._folder / "meta" / "stats.json"
+        stats = json.loads(_text(path)) if path.exists() else {}
+        missing = [name for name in self._actions if not {"min", "max"} <= set(stats.get(name, ()))]
+        if missing:
+            raise ValueError(
+                f"{path} does not say the least and greatest {missing[0]!r}; give the limits of "
+                "the actions, low=[...] and high=[...] (--low, --high)"
+            )
+        low = np.concatenate([np.ravel(stats[name]["min"]) for name in self._actions])
+        high = np.concatenate([np.ravel(stats[name]["max"]) for name in self._actions])
+        return low.astype(np.float64), high.astype(np.float64)
 
     def _episodes(self) -> list[dict[str, Any]]:
         files = sorted((self._folder / "meta" / "episodes").rglob("*.parquet"))
-        wanted = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
+        prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
         rows = []
         for file in files:
             names = self._parquet.read_schema(file).names
-            columns = [name for name in names if name.startswith(wanted)]
+            columns = [name for name in names if name.startswith(prefixes)]
             rows += self._parquet.read_table(file, columns=columns).to_pylist()
+        if not rows:
+            raise ValueError(f"{self._folder} has no episodes in meta/episodes")
         long = [row for row in rows if row["length"] > 1]
         warn_left_out(len(rows) - len(long), self._folder)
-        return sorted(long, key=lambda row: row["episode_index"])
+        return sorted(long, key=lambda row: int(row["episode_index"]))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -98,18 +115,17 @@ class LeRobotEpisodes(Episodes):
         table = self._table(row)
         if table.num_rows != row["length"]:
             raise ValueError(f"{source} has {table.num_rows} rows, {row['length']} expected")
-        action = np.array(table["action"].to_pylist(), np.float64)
-        reward = (
-            table["next.reward"].to_numpy()[:-1] if "next.reward" in table.schema.names else None
-        )
-        video = self._info["features"][self._camera]["dtype"] == "video"
-        image = self._video(row, table, source) if video else self._pictures(table)
+        parts = [np.array(table[name].to_pylist(), np.float64) for name in self._actions]
+        action = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        rewarded = "next.reward" in table.schema.names
+        image = self._video(row, table, source) if self._is_video else self._pictures(table, source)
         tasks = row.get("tasks") or [None]
         return self._trajectory(
             image,
-            rescaled(action.reshape(len(action), -1), self._low, self._high)[:-1],
-            reward,
+            action[:-1],
+            np.ravel(table["next.reward"].to_pylist())[:-1] if rewarded else None,
             source,
+            self._own_limits,
             embodiment=self.embodiment or self._info.get("robot_type"),
             task=self.task or tasks[0],
         )
@@ -121,20 +137,25 @@ class LeRobotEpisodes(Episodes):
         )
         if self._open is None or self._open[0] != path:
             names = self._parquet.read_schema(path).names
-            wanted = ("action", "episode_index", "frame_index", "timestamp", "next.reward")
-            columns = [name for name in names if name in (*wanted, self._camera)]
+            usual = ("episode_index", "frame_index", "timestamp", "next.reward")
+            columns = [n for n in names if n in (*usual, *self._actions, self._camera)]
             self._open = path, self._parquet.read_table(path, columns=columns)
         table = self._open[1]
         mine = np.flatnonzero(table["episode_index"].to_numpy() == row["episode_index"])
         return table.take(mine).sort_by("frame_index")
 
-    def _pictures(self, table: Any) -> np.ndarray:
-        image = needs("PIL.Image", "images in LeRobot datasets")
-        found = []
+    def _pictures(self, table: Any, source: str) -> np.ndarray:
+        """Images in the table, or at paths that are relative to the dataset."""
+        reader = needs("PIL.Image", "images in LeRobot datasets")
+        images = []
         for cell in table[self._camera].to_pylist():
-            picture = image.open(io.BytesIO(cell["bytes"]) if cell["bytes"] else cell["path"])
-            found.append(as_images(np.array(picture.convert("RGB"))[None], self.image_size))
-        return np.concatenate(found)
+            data = io.BytesIO(cell["bytes"]) if cell["bytes"] else self._folder / cell["path"]
+            try:
+                picture = np.array(reader.open(data).convert("RGB"))
+            except (OSError, SyntaxError) as error:
+                raise ValueError(f"{source}: {cell['path']} cannot be read: {error}") from error
+            images.append(as_images(picture[None], self._resize))
+        return np.concatenate(images)
 
     def _video(self, row: dict[str, Any], table: Any, source: str) -> np.ndarray:
         """The episode's frames, each resized as soon as it is decoded."""
@@ -147,19 +168,19 @@ class LeRobotEpisodes(Episodes):
         times = row[prefix + "from_timestamp"] + np.ravel(table["timestamp"].to_numpy()).astype(
             np.float64
         )
-        found: list[np.ndarray] = []
-        slack = 0.5 / self._info["fps"]
+        images: list[np.ndarray] = []
+        slack = 0.5 / self._info["fps"]  # half a frame: a time stamp may be rounded
         for time, frame in _frames(path, float(times[0]), slack):
-            if len(found) == len(times) or abs(time - times[len(found)]) > slack:
+            if len(images) == len(times) or abs(time - times[len(images)]) > slack:
                 break
-            found.append(as_images(frame[None], self.image_size))
-        if len(found) < len(times):
-            raise ValueError(f"{source}: {path} has no frame at {times[len(found)]:.3f} s")
-        return np.concatenate(found)
+            images.append(as_images(frame[None], self._resize))
+        if len(images) < len(times):
+            raise ValueError(f"{source}: {path} has no frame at {times[len(images)]:.3f} s")
+        return np.concatenate(images)
 
 
-def _frames(path: Path, start: float, slack: float) -> Any:
-    """Yields (time, frame) of a video from `start` seconds on."""
+def _frames(path: Path, start: float, slack: float) -> Iterator[tuple[float, np.ndarray]]:
+    """Yield (time, frame) of a video from `start` seconds on."""
     av = needs("av", "videos")
     try:
         with av.open(str(path)) as container:
@@ -175,4 +196,4 @@ def _frames(path: Path, start: float, slack: float) -> Any:
 def _text(path: Path) -> str:
     if not path.exists():
         raise ValueError(f"{path} does not exist; is this a LeRobot dataset of version 3?")
-    return path.read_text()
+    return path.read_text(encoding="utf-8")

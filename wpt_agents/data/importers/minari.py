@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.data.importers.episodes import Episodes, both_limits, needs, rescaled
+from wpt_agents.data.importers.episodes import Episodes, needs
 from wpt_agents.data.trajectory import Trajectory
 
 
@@ -20,30 +20,25 @@ def local_minari(name: str) -> Path:
 class MinariEpisodes(Episodes):
     """A Minari dataset's episodes; actions are rescaled from its action space to [-1, 1].
 
-    :param name: a local dataset's name (`namespace/name-v0`), its folder, or the `data` in it
-    :param image_key: where the images are in a dictionary observation; dots go deeper
-    :param low: (A,) the actions' limits, if not those of the action space
-    :param high: (A,)
+    :param name: a local dataset's name (`namespace/name-v0`), its folder, the `data` in it, or a
+        MinariDataset
+    :param options: those of `Episodes`; in keys, dots or slashes lead into dictionaries
     """
 
-    def __init__(
-        self,
-        name: str | os.PathLike[str],
-        image_key: str | None = None,
-        low: np.ndarray | None = None,
-        high: np.ndarray | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, name: Any, **options: Any) -> None:
         super().__init__(**options)
-        self._limits = both_limits(low, high)
+        self._refuse_done_key("Minari")
         minari = needs("minari", "Minari datasets")
-        folder = Path(name)
-        if folder.exists():
-            inner = folder / "data"
-            self._data = minari.MinariDataset(inner if inner.exists() else folder)
+        if isinstance(name, str | os.PathLike):
+            folder = Path(name)
+            if folder.exists():
+                inner = folder / "data"
+                self._data = minari.MinariDataset(inner if inner.exists() else folder)
+            else:
+                self._data = minari.load_dataset(str(name))
         else:
-            self._data = minari.load_dataset(str(name))
-        self._name, self._key = self._data.spec.dataset_id, image_key
+            self._data = name
+        self._name = self._data.spec.dataset_id
         if self._data.storage.metadata.get("jpeg_encoding"):
             warnings.warn(
                 f"Minari stored the images of {self._name} as JPEG, which is lossy; record with "
@@ -52,32 +47,48 @@ class MinariEpisodes(Episodes):
             )
 
     def __len__(self) -> int:
-        return self._data.total_episodes
+        return int(self._data.total_episodes)
 
     def __getitem__(self, i: int) -> Trajectory:
-        episode, space = self._data[i], self._data.action_space
+        episode = self._data[i]
         source = f"{self._name} episode {episode.id}"
-        if not hasattr(space, "low"):
-            raise ValueError(f"{self._name} has the actions {space}; they must be a Box")
-        limits = self._limits or (space.low, space.high)
+        parts = [self._actions(key, episode.actions) for key in self.action_keys or ("",)]
+        action, low, high = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
         return self._trajectory(
-            self._images(episode.observations),
-            rescaled(np.asarray(episode.actions), *limits),
+            self._leaf(episode.observations, self.image_key, "image_key"),
+            action,
             np.asarray(episode.rewards),
-            source=source,
+            source,
+            None if self.limits is not None else (low, high),
             terminated=bool(episode.terminations[-1]),
         )
 
-    def _images(self, observations: Any) -> np.ndarray:
-        for key in self._key.split(".") if self._key else ():
-            if key not in observations:
-                raise ValueError(
-                    f"{self._name} has no {key!r}; there are: {', '.join(observations)}"
-                )
-            observations = observations[key]
-        if isinstance(observations, dict):
+    def _actions(self, key: str, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The actions under a key, and the limits of their space."""
+        space = self._data.action_space
+        for part in _parts(key):
+            space = space[part] if part in getattr(space, "spaces", {}) else None
+        chosen = np.asarray(self._leaf(actions, key, "action_key"))
+        if not hasattr(space, "low"):
+            raise ValueError(f"{self._name} has the actions {space}; they must be a Box")
+        return chosen.reshape(len(chosen), -1), np.ravel(space.low), np.ravel(space.high)
+
+    def _leaf(self, tree: Any, key: str | None, option: str) -> np.ndarray:
+        """What is under a key in nested dictionaries.
+
+        :raises ValueError: nothing, or a dictionary
+        """
+        for part in _parts(key):
+            if not isinstance(tree, dict) or part not in tree:
+                there = ", ".join(tree) if isinstance(tree, dict) else "an array without keys"
+                raise ValueError(f"{self._name} has no {part!r}; there are: {there}")
+            tree = tree[part]
+        if isinstance(tree, dict):
             raise ValueError(
-                f"{self._name} has several observations; give image_key, one of: "
-                f"{', '.join(observations)}"
+                f"{self._name} has several of them; give {option}, one of: {', '.join(tree)}"
             )
-        return np.asarray(observations)
+        return np.asarray(tree)
+
+
+def _parts(key: str | None) -> list[str]:
+    return key.replace("/", ".").split(".") if key else []

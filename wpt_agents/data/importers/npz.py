@@ -1,10 +1,14 @@
-"""One compressed `.npz` an episode: ExORL, URLB, DrQ-v2, the official NCRL data, Dreamer, V-D4RL.
+"""`.npz` files: an episode each (ExORL, URLB, DrQ-v2, the official NCRL data, Dreamer), or rows.
 
-Arrays are T + 1 long, and action t is the one that *led to* observation t: the first is a
-placeholder, as is the first reward. So action t of ours is their action t + 1.
+In a file per episode, arrays are T + 1 long, and action t is the one that *led to* observation t:
+the first is a placeholder, as is the first reward. So our action t is their action t + 1.
+
+In a file of rows (OGBench), flags such as `terminals` say where episodes end; action t was taken at
+observation t. Such files are read row by row, never as a whole.
 """
 
 import os
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -12,92 +16,204 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.data.importers.episodes import Episodes, both_limits, rescaled, warn_left_out
+from wpt_agents.data.importers.episodes import Episodes, warn_left_out
+from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, first, natural
+from wpt_agents.data.importers.tables import TableEpisodes
 from wpt_agents.data.trajectory import Trajectory
 
 IMAGE_KEYS = ("observation", "image", "pixels")
-OTHERS = ("action", "reward", "discount", "is_terminal", "is_first")
+OTHERS = ("reward", "discount", "is_terminal", "is_first")
+FAULTS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError)
 
 
 class NpzEpisodes(Episodes):
-    """The `.npz` files of a folder and the folders in it, by name.
+    """The episodes of a `.npz` file, or of all in a folder and the folders in it, by name.
 
-    :param folder: searched for episodes
-    :param image_key: the images' array; else the first found of observation, image, pixels
-    :param low: (A,) the actions' limits, if they are not in [-1, 1]
-    :param high: (A,)
+    :param folder: searched for `.npz` files; those without actions and images are skipped
+    :param options: those of `Episodes`
     """
 
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        image_key: str | None = None,
-        low: np.ndarray | None = None,
-        high: np.ndarray | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, folder: str | os.PathLike[str], **options: Any) -> None:
         super().__init__(**options)
-        self._limits = both_limits(low, high)
-        self._folder, self._keys = Path(folder), (image_key,) if image_key else IMAGE_KEYS
-        files = sorted(self._folder.rglob("*.npz"))
+        path = Path(folder)
+        self._folder = path.parent if path.is_file() else path
+        self._image_keys = (self.image_key,) if self.image_key else IMAGE_KEYS
+        self._action_keys = self.action_keys or ("action",)
+        files = [path] if path.is_file() else sorted(path.rglob("*.npz"))
         if not files:
             raise ValueError(f"{folder} holds no .npz file")
-        self._files = [file for file in files if not self._is_single(file)]
-        warn_left_out(len(files) - len(self._files), folder)
+        kinds = {file: self._kind(file) for file in files}
+        self._files = [file for file, kind in kinds.items() if kind == "episode"]
+        self._flat = FlatNpz(path, **options) if "flat" in kinds.values() else None
+        strange = [file for file, kind in kinds.items() if kind == "other"]
+        if strange and (self._files or self._flat):
+            warnings.warn(
+                f"{folder}: {len(strange)} .npz files without actions and images are skipped, "
+                f"{strange[0].name} for example",
+                stacklevel=2,
+            )
+        elif strange:
+            self._files = strange  # so that reading says what they lack
+        warn_left_out(list(kinds.values()).count("single"), folder)
 
-    def _is_single(self, file: Path) -> bool:
-        """Whether an episode has one image; what is damaged or strange is named when it is read."""
+    def _kind(self, file: Path) -> str:
+        """What a file is: an "episode", "single" for one of a single image, "flat", or "other".
+
+        What is damaged counts as an episode, so that reading it names it.
+        """
+        if is_flat(file):
+            return "flat"
         try:
-            if len(_arrays(file, {"action"}).get("action", ())) != 1:
-                return False
-            return {len(images) for images in _arrays(file, set(self._keys)).values()} == {1}
+            names = names_of(file)
+            images = [key for key in self._image_keys if key in names]
+            actions = [key for key in self._action_keys if key in names]
+            if not images and not actions:
+                return "other"
+            if actions and len(arrays_of(file, set(actions)).get(actions[0], ())) == 1:
+                lengths = {len(array) for array in arrays_of(file, set(images)).values()}
+                return "single" if lengths == {1} else "episode"
         except (ValueError, TypeError):  # TypeError: a number in place of an array
-            return False
+            pass
+        return "episode"
 
     def __len__(self) -> int:
-        return len(self._files)
+        return len(self._files) + (0 if self._flat is None else len(self._flat))
 
     def __getitem__(self, i: int) -> Trajectory:
+        if self._flat is not None and i >= len(self._files):
+            return self._flat[i - len(self._files)]
         file = self._files[i]
-        arrays = _arrays(file, {*self._keys, *OTHERS})
-        key = next((key for key in self._keys if key in arrays), None)
-        if key is None or "action" not in arrays:
-            raise ValueError(
-                f"{file} holds {sorted(arrays) or 'nothing known'}; an episode needs 'action' and "
-                f"one of {', '.join(self._keys)}"
-            )
-        if len(arrays["action"]) != len(arrays[key]):
-            raise ValueError(
-                f"{file} has {len(arrays['action'])} actions for {len(arrays[key])} images; in "
-                "this format they are equally many, the first action a placeholder"
-            )
-        if arrays.get("is_first", np.zeros(1))[1:].any():
-            raise ValueError(
-                f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
-                "write a file an episode"
-            )
+        wanted = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
+        arrays = arrays_of(file, wanted)
+        key = self._check(file, arrays)
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
+        if self.done_key is not None:
+            over = arrays[self.done_key]
         return self._trajectory(
             arrays[key],
-            self._rescaled(arrays["action"][1:]),
+            self._actions(arrays),
             arrays["reward"][1:] if "reward" in arrays else None,
             source=file.relative_to(self._folder).as_posix(),
             terminated=bool(np.ravel(over)[-1] == 1),
             **self._labels(file),
         )
 
-    def _rescaled(self, action: np.ndarray) -> np.ndarray:
-        """(T, A) in the file's own limits -> (T, A) in [-1, 1]."""
-        return rescaled(action, *self._limits) if self._limits else action
+    def _actions(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """The actions without the placeholder, several arrays side by side."""
+        actions = [np.asarray(arrays[name][1:]) for name in self._action_keys]
+        if len(actions) == 1:
+            return actions[0]
+        return np.concatenate([a.reshape(len(a), -1) for a in actions], axis=1)
 
-    def _labels(self, file: Path) -> dict[str, str]:
+    def _labels(self, file: Path) -> dict[str, Any]:
         """What the file's path says of robot and task, where nothing else was asked for."""
         return {}
 
+    def _done_keys(self) -> tuple[str, ...]:
+        return () if self.done_key is None else (self.done_key,)
 
-def _arrays(file: Path, names: set[str]) -> dict[str, np.ndarray]:
+    def _check(self, file: Path, arrays: dict[str, np.ndarray]) -> str:
+        """The images' key.
+
+        :raises ValueError: an array is missing or of another length, or there are several episodes
+        """
+        key = next((key for key in self._image_keys if key in arrays), None)
+        needed = (*self._action_keys, *self._done_keys())
+        if key is None or any(name not in arrays for name in needed):
+            raise ValueError(
+                f"{file} holds {', '.join(names_of(file)) or 'nothing'}; an episode needs "
+                f"{', '.join(map(repr, needed))} and one of {', '.join(self._image_keys)}; name "
+                "them by image_key and action_key (--image-key, --action-key)"
+            )
+        for name in self._action_keys:
+            if arrays[name].shape[:1] != arrays[key].shape[:1]:
+                raise ValueError(
+                    f"{file} has {arrays[name].shape[0]} actions for {len(arrays[key])} images; in "
+                    "this format they are equally many, the first action a placeholder"
+                )
+        if arrays.get("is_first", np.zeros(1))[1:].any():
+            raise ValueError(
+                f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
+                "write a file an episode"
+            )
+        return key
+
+
+class FlatNpz(TableEpisodes):
+    """The episodes of `.npz` files of rows."""
+
+    _archive: zipfile.ZipFile | None = None
+
+    def _list(self, path: Path) -> list[Path]:
+        files = [path] if path.is_file() else sorted(path.rglob("*.npz"), key=natural)
+        return [file for file in files if is_flat(file)]
+
+    def _read(self, file: Path) -> Table:
+        if self._archive is not None:
+            self._archive.close()
+        try:
+            self._archive = zipfile.ZipFile(file)
+            names = [n.removesuffix(".npy") for n in self._archive.namelist()]
+            return {name: Member(self._archive, name) for name in names}
+        except FAULTS as error:
+            raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error
+
+
+class Member:
+    """An array in an `.npz` archive of which rows are read; quick if they are read in order.
+
+    :ivar shape: of the whole array
+    :ivar dtype: of its numbers
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        self._archive = archive
+        self._name = f"{name}.npy"
+        self._stream = archive.open(self._name)
+        version = np.lib.format.read_magic(self._stream)  # type: ignore[no-untyped-call]
+        read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
+        self.shape, fortran, self.dtype = read(self._stream)
+        if self.dtype.hasobject or fortran:
+            raise ValueError(f"{name} is no plain array in C order")
+        self._data = self._stream.tell()
+
+    def __len__(self) -> int:
+        return int(self.shape[0]) if self.shape else 0
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        start, stop, _ = rows.indices(len(self))
+        size = int(self.dtype.itemsize * np.prod(self.shape[1:], dtype=np.int64))
+        try:
+            self._stream.seek(self._data + start * size)
+            data = self._stream.read((stop - start) * size)
+        except FAULTS as error:
+            file = self._archive.filename
+            raise ValueError(f"{file} is damaged in {self._name}: {error}") from error
+        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
+
+
+def is_flat(file: Path) -> bool:
+    """Whether a file holds rows of many episodes, whose ends are flagged."""
+    try:
+        names = names_of(file)
+    except ValueError:
+        return False
+    return first(ACTIONS, names) is not None and first(ENDS, names) is not None
+
+
+def names_of(file: Path) -> list[str]:
+    """The names of the arrays in a file."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+    except FAULTS as error:
+        raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error
+
+
+def arrays_of(file: Path, names: set[str]) -> dict[str, np.ndarray]:
+    """Some arrays of a file, in memory."""
     try:
         with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files if name in names}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError) as error:
+    except FAULTS as error:
         raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error

@@ -32,14 +32,20 @@ class OfficialEpisodes(NpzEpisodes):
             )
         super().__init__(folder, **options)
 
-    def _is_single(self, file: Path) -> bool:
+    def _kind(self, file: Path) -> str:
         length = file.stem.rpartition("-")[2]  # tens of thousands of files are not opened for it
-        return int(length) == 0 if length.isdecimal() else super()._is_single(file)
+        if not length.isdecimal():
+            return super()._kind(file)
+        return "episode" if int(length) > 0 else "single"
 
-    def _rescaled(self, action: np.ndarray) -> np.ndarray:
-        return action.clip(-1, 1)
+    def _actions(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        return super()._actions(arrays).clip(-1, 1)
 
-    def _labels(self, file: Path) -> dict[str, str]:
+    def _limits_of(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        ones = np.ones(action.shape[1])
+        return super()._limits_of(action) or (-ones, ones)
+
+    def _labels(self, file: Path) -> dict[str, Any]:
         suite, *folders = _below_suite(file.parent)
         name = folders[0] if folders else None
         labels = {"embodiment": name} if suite == DMC else {"embodiment": "sawyer", "task": name}

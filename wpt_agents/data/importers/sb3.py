@@ -2,12 +2,12 @@
 
 Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it rescaled. With
 `optimize_memory_usage` the observation after an episode's last action is overwritten, so that
-action is left out, and no terminal state is seen; nor is it seen where `learn` was called again and
-left an episode for a new one, which then is taken for its continuation.
+action is left out, and no terminal state is seen.
 """
 
 import os
 import pickle
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -24,25 +24,28 @@ class SB3Episodes(Episodes):
     """A replay buffer's episodes, environment by environment, oldest first.
 
     :param buffer: in memory, or a file of `model.save_replay_buffer`
-    :param image_key: where the images are, if observations are dictionaries
     :param trust: load a file; SB3's are pickles, which run whatever code is in them
+    :param options: those of `Episodes`; `image_key` chooses from dictionary observations
     """
 
     def __init__(
         self,
         buffer: ReplayBuffer | str | os.PathLike[str],
-        image_key: str | None = None,
         trust: bool = False,
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        self._refuse_done_key("SB3")
+        if self.action_keys:
+            raise ValueError("SB3's replay buffers have one array of actions; leave action_key out")
         if isinstance(buffer, str | os.PathLike):
             buffer = _load(buffer, trust)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"Expected a ReplayBuffer of SB3, got {type(buffer).__name__}")
         if not isinstance(buffer.action_space, spaces.Box):
             raise ValueError(f"The buffer's actions are {buffer.action_space}; they must be a Box")
-        self._buffer, self._key = buffer, image_key
+        self._buffer = buffer
+        self._limits = buffer.action_space.low, buffer.action_space.high
         self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
         first = buffer.pos if buffer.full else 0
         self._rows = (first + np.arange(buffer.size())) % buffer.buffer_size
@@ -63,7 +66,7 @@ class SB3Episodes(Episodes):
         return bounds
 
     def _find_resets(self, env: int) -> list[int]:
-        """Where an observation is not what the step before led to: `learn` has begun anew."""
+        """The rows whose observation the step before did not lead to: `learn` began again."""
         if self._overwritten:
             return []
         seen = self._images(self._buffer.observations)
@@ -87,17 +90,21 @@ class SB3Episodes(Episodes):
             over = buffer.dones[rows[-1], env] and not buffer.timeouts[rows[-1], env]
             terminated = bool(over)
         source = f"SB3 replay buffer, environment {env}, steps {start} to {stop - 1}"
-        action, reward = buffer.actions[rows, env], buffer.rewards[rows, env]
-        return self._trajectory(image, action, reward, source, terminated=terminated)
+        action = buffer.actions[rows, env]
+        reward = buffer.rewards[rows, env]
+        trajectory = self._trajectory(image, action, reward, source, terminated=terminated)
+        # SB3 has rescaled the actions already, from the bounds of the environment's space.
+        known = self.limits is None and np.isfinite(self._limits).all()
+        return replace(trajectory, bounds=np.stack(self._limits)) if known else trajectory
 
     def _images(self, observations: Any) -> np.ndarray:
         if not isinstance(observations, dict):
-            return observations
-        if self._key not in observations:
+            return np.asarray(observations)
+        if self.image_key not in observations:
             raise ValueError(
                 f"The replay buffer's observations are {', '.join(observations)}; give image_key"
             )
-        return observations[self._key]
+        return np.asarray(observations[self.image_key])
 
 
 def _load(path: str | os.PathLike[str], trust: bool) -> ReplayBuffer:
@@ -108,6 +115,7 @@ def _load(path: str | os.PathLike[str], trust: bool) -> ReplayBuffer:
         )
     try:
         with open(path, "rb") as file:
-            return load_from_pkl(file)
+            loaded: ReplayBuffer = load_from_pkl(file)
+            return loaded
     except (OSError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(f"{path} cannot be read as a replay buffer of SB3: {error}") from error

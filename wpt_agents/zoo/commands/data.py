@@ -109,7 +109,9 @@ def import_data(
     form: Annotated[
         str,
         typer.Argument(
-            metavar="FORMAT", help="hdf5, lerobot, minari, npz, official, rlds, sb3 or auto."
+            metavar="FORMAT",
+            help="hdf5, lerobot, minari, npz, official, rlds, sb3, tdmpc2, zarr, or auto to "
+            "recognise it.",
         ),
     ],
     source: Annotated[
@@ -119,7 +121,7 @@ def import_data(
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="DST", help="The folder of the dataset; an unfinished one is continued."
+            metavar="DST", help="The dataset's folder; a conversion that was cut short goes on."
         ),
     ],
     embodiment: Annotated[
@@ -128,29 +130,47 @@ def import_data(
     task: Annotated[
         str | None, typer.Option(help="The name of the task, for all episodes.")
     ] = None,
-    rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
+    rewards: Annotated[bool, typer.Option("--rewards", help="Keep the rewards.")] = False,
     image_size: Annotated[
-        int, typer.Option(min=1, help="The width that images are resized to; WPT takes 64.")
+        int, typer.Option(min=1, help="Resize images to this height and width; WPT takes 64.")
     ] = 64,
-    image_key: Annotated[str | None, typer.Option(help="The key of the images.")] = None,
+    crop: Annotated[
+        bool, typer.Option("--crop", help="Cut out the middle square instead of squeezing images.")
+    ] = False,
+    image_key: Annotated[
+        str | None, typer.Option(help="Name of the images' array, or of the camera.")
+    ] = None,
     action_key: Annotated[
-        str | None, typer.Option(help="The key of the actions, for rlds.")
+        str | None,
+        typer.Option(help="Name of the actions' array, or several with commas between them."),
+    ] = None,
+    done_key: Annotated[
+        str | None, typer.Option(help="Name of the flags at which episodes end.")
+    ] = None,
+    shifted: Annotated[
+        bool | None,
+        typer.Option(
+            "--shifted/--no-shifted",
+            help="hdf5 and zarr: whether a row's action led to its observation (dm_env) or was "
+            "taken at it.",
+        ),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="The camera, for lerobot data with several.")
+        str | None, typer.Option(help="lerobot: name of the camera, as --image-key.")
     ] = None,
     split: Annotated[
-        str | None, typer.Option(help="The only split to import, for rlds, e.g. train.")
+        str | None, typer.Option(help="rlds: read this split only, for example train.")
     ] = None,
     low: Annotated[
         str | None,
-        typer.Option(help="The lower limits of the actions, e.g. `--low=-2,-2`; not for sb3."),
+        typer.Option(help="Lowest values of the actions, if not -1: `--low=-2,-2`, or one."),
     ] = None,
     high: Annotated[
-        str | None, typer.Option(help="The upper limits of the actions, e.g. `--high=2,2`.")
+        str | None, typer.Option(help="Highest values of the actions, if not 1: `--high=2,2`.")
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Load a pickle, for sb3, which may run any code.")
+        bool,
+        typer.Option("--trust", help="sb3 and tdmpc2: load a pickle, which may run any code."),
     ] = False,
 ) -> None:
     """Convert other people's data into a dataset; the same command continues an unfinished one.
@@ -160,16 +180,19 @@ def import_data(
     from wpt_agents.data.dataset import TrajectoryDataset
     from wpt_agents.data.importers.formats import open_episodes
 
-    given: dict[str, Any] = {
+    options: dict[str, Any] = {
         "image_key": image_key,
         "action_key": action_key,
+        "done_key": done_key,
+        "crop": crop or None,
+        "shifted": shifted,
         "camera": camera,
         "split": split,
         "low": _numbers("--low", low),
         "high": _numbers("--high", high),
         "trust": trust or None,
     }
-    options = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in options.items() if value is not None}
     shared = {"embodiment": embodiment, "task": task, "rewards": rewards, "image_size": image_size}
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)

@@ -1,0 +1,375 @@
+"""HDF5, .npz and zarr files of robomimic, LIBERO, ALOHA, D4RL, V-D4RL, OGBench, Diffusion Policy.
+
+Each is written in its program's own layout, from a known chain, and must come back as the chain.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chain import chain, follows
+
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.importers.formats import open_episodes, recognise
+
+h5py = pytest.importorskip("h5py")
+SMALL = {"image_size": 8}
+
+
+def check(new, old, images=None):
+    """`new` is the chain `old`, or its first `images` images."""
+    np.testing.assert_array_equal(new.image, old.image[:images])
+    state = new.image[:, 0, 0, 0].astype(int)
+    assert (follows(state[:-1], new.action[:, 0]) == state[1:]).all()
+    np.testing.assert_allclose(new.action, old.action[: len(new)], atol=1e-6)
+
+
+def save_robomimic(path, trajectories, with_next=True, cameras=("agentview_image",), suffix=""):
+    """data/demo_i/{actions, rewards, dones, states, obs/*, next_obs/*}; numbers without zeros."""
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "type": 1, "env_kwargs": {}})
+        for i, t in enumerate(trajectories):
+            demo = data.create_group(f"demo_{i}{suffix}")
+            demo["actions"] = t.action.astype(np.float64)
+            demo["rewards"] = t.reward
+            demo["dones"] = np.arange(len(t)) >= len(t) - 2  # robomimic flags each success
+            demo["states"] = np.zeros((len(t), 32))
+            demo["obs/robot0_eef_pos"] = np.zeros((len(t), 3))
+            for k, camera in enumerate(cameras):
+                demo[f"obs/{camera}"] = (t.image[:-1] + k).astype(np.uint8)
+                if with_next:
+                    demo[f"next_obs/{camera}"] = (t.image[1:] + k).astype(np.uint8)
+        file["mask/train"] = np.array([b"demo_0", b"demo_10"])
+
+
+@pytest.mark.parametrize("with_next", [True, False])
+def test_robomimic_demos_come_in_numeric_order_and_keep_to_the_chain(tmp_path, with_next):
+    old = [chain(5 + i, i) for i in range(12)]
+    save_robomimic(tmp_path / "image.hdf5", old, with_next)
+    new = list(open_episodes(tmp_path / "image.hdf5", **SMALL))
+    assert len(new) == 12
+    for found, expected in zip(new, old, strict=True):
+        check(found, expected, None if with_next else len(expected))
+    assert (new[10].source, new[10].task) == ("image.hdf5 data/demo_10", "Lift")
+
+
+def test_the_main_camera_of_robomimic_is_taken_and_another_can_be_named(tmp_path):
+    old = chain(6)
+    cameras = ("robot0_eye_in_hand_image", "agentview_image")
+    save_robomimic(tmp_path / "a.hdf5", [old], cameras=cameras)
+    with pytest.warns(UserWarning, match=r"'obs/agentview_image' is taken; .* another: obs/r"):
+        [main] = open_episodes(tmp_path / "a.hdf5", **SMALL)
+    np.testing.assert_array_equal(main.image, old.image + 1)
+    for key in ("robot0_eye_in_hand_image", "data/demo_0/obs/robot0_eye_in_hand_image"):
+        [hand] = open_episodes(tmp_path / "a.hdf5", image_key=key, **SMALL)
+        check(hand, old)
+
+
+def test_libero_names_its_task_in_words(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(5)], False, ("agentview_rgb",))
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        problem = {"language_instruction": "put the bowl on the plate"}
+        file["data"].attrs["problem_info"] = json.dumps(problem)
+    [new] = open_episodes(tmp_path / "a.hdf5", **SMALL)
+    assert new.task == "put the bowl on the plate"
+    [named] = open_episodes(tmp_path / "a.hdf5", task="bowl", **SMALL)
+    assert named.task == "bowl"
+
+
+def test_aloha_has_a_file_an_episode(tmp_path):
+    old = [chain(5 + i, i, action_dim=14) for i in range(3)]
+    for i, t in enumerate(old):
+        with h5py.File(tmp_path / f"episode_{i}.hdf5", "w") as file:
+            file.attrs["sim"] = True
+            file["action"] = t.action
+            file["observations/qpos"] = np.zeros((len(t), 14))
+            file["observations/images/top"] = t.image[:-1]
+    assert recognise(tmp_path) == "hdf5"
+    for found, expected in zip(open_episodes(tmp_path, **SMALL), old, strict=True):
+        check(found, expected, len(expected))
+    [one] = open_episodes(tmp_path / "episode_1.hdf5", **SMALL)
+    check(one, old[1], len(old[1]))
+
+
+def test_groups_with_an_observation_more_than_actions_keep_every_action(tmp_path):
+    old = [chain(5, 0), chain(1, 1)]  # as ManiSkill's traj_0/obs/sensor_data/...
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for i, t in enumerate(old):
+            file[f"traj_{i}/actions"] = t.action
+            file[f"traj_{i}/obs/sensor_data/base_camera/rgb"] = t.image
+            file[f"traj_{i}/terminated"] = np.arange(len(t)) == len(t) - 1
+    for found, expected in zip(
+        open_episodes(tmp_path / "a.h5", image_key="rgb", **SMALL), old, strict=True
+    ):
+        check(found, expected)
+        assert found.terminated
+
+
+def rows(trajectories, image="observations", action="actions"):
+    return {
+        image: np.concatenate([t.image[:-1] for t in trajectories]),
+        action: np.concatenate([t.action for t in trajectories]),
+    }
+
+
+def last(trajectories):
+    return np.concatenate([np.arange(len(t)) == len(t) - 1 for t in trajectories])
+
+
+def save(path, arrays):
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
+    return path
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"terminals": 0, "timeouts": 1},
+        {"terminations": 0, "truncations": 1},
+        {"terminated": 1, "truncated": 0},
+        {"dones": 1},
+        {"done": 1},
+    ],
+    ids=lambda flags: "-".join(flags),
+)
+def test_flat_rows_end_where_any_of_the_usual_flags_says(tmp_path, flags):
+    old = [chain(5, 0), chain(7, 1), chain(2, 2)]
+    arrays = rows(old) | {name: last(old) * on for name, on in flags.items()}
+    new = list(open_episodes(save(tmp_path / "a.hdf5", arrays), **SMALL))
+    for found, expected in zip(new, old, strict=True):
+        check(found, expected, len(expected))
+
+
+def test_a_flag_of_another_name_is_named_by_done_key(tmp_path):
+    old = [chain(5, 0), chain(7, 1)]
+    path = save(tmp_path / "a.hdf5", rows(old) | {"episode_over": last(old)})
+    with pytest.raises(ValueError, match=r"nothing says where episodes end.* done_key"):
+        open_episodes(path, **SMALL)
+    new = open_episodes(path, done_key="episode_over", **SMALL)
+    assert [len(t) for t in new] == [4, 6]
+    with pytest.raises(ValueError, match="no array 'over'; there are: actions, episode_over"):
+        open_episodes(path, done_key="over", **SMALL)
+
+
+def test_the_companion_of_nested_images_gives_the_last_observation(tmp_path):
+    old = [chain(5, 0), chain(7, 1)]
+    arrays = rows(old, "observations/image") | {
+        "terminals": last(old),
+        "next_observations/image": np.concatenate([t.image[1:] for t in old]),
+    }
+    path = save(tmp_path / "a.hdf5", arrays)
+    with pytest.raises(ValueError, match="no usual name; there are images in: observations/image"):
+        open_episodes(path, **SMALL)
+    for found, expected in zip(
+        open_episodes(path, image_key="observations/image", **SMALL), old, strict=True
+    ):
+        check(found, expected)
+        assert found.terminated
+
+
+def save_dm_env(path, trajectories, first=0.0):
+    """V-D4RL's: row t holds the action that led to observation t; step types 0, 1 and 2."""
+    blank = np.full((1, 2), first, np.float32)
+    return save(
+        path,
+        {
+            "observation": np.concatenate([t.image for t in trajectories]),
+            "action": np.concatenate([np.concatenate([blank, t.action]) for t in trajectories]),
+            "reward": np.concatenate([[0, *t.reward] for t in trajectories]),
+            "discount": np.concatenate([[1] * len(t) + [not t.terminated] for t in trajectories]),
+            "step_type": np.concatenate([[0] + [1] * (len(t) - 1) + [2] for t in trajectories]),
+        },
+    )
+
+
+def test_rows_of_dm_env_are_shifted_back(tmp_path):
+    old = [chain(5, 0, terminated=True), chain(7, 1)]
+    path = save_dm_env(tmp_path / "a.hdf5", old)
+    for found, expected in zip(open_episodes(path, rewards=True, **SMALL), old, strict=True):
+        check(found, expected)
+        np.testing.assert_allclose(found.reward, expected.reward)
+        assert found.terminated == expected.terminated
+
+
+def test_rows_of_step_types_without_placeholders_are_asked_about(tmp_path):
+    path = save_dm_env(tmp_path / "a.hdf5", [chain(5, 0)], first=0.5)
+    with pytest.raises(ValueError, match=r"first action of an episode is zero.* shifted=True if"):
+        open_episodes(path, **SMALL)
+    check(open_episodes(path, shifted=True, **SMALL)[0], chain(5, 0))
+    unshifted = open_episodes(path, shifted=False, **SMALL)[0]
+    assert unshifted.action[0].tolist() == [0.5, 0.5]
+
+
+def test_actions_in_several_arrays_are_put_side_by_side_in_the_order_of_the_keys(tmp_path):
+    old = chain(5, 0)
+    arrays = {
+        "observations": old.image[:-1],
+        "action/arm": old.action[:, 0],  # one number a step
+        "action/gripper": old.action[:, 1:],
+        "terminals": last([old]),
+    }
+    path = save(tmp_path / "a.hdf5", arrays)
+    with pytest.raises(ValueError, match="action_key, one or several of: action/arm, action/gr"):
+        open_episodes(path, **SMALL)
+    for key in (["action/arm", "action/gripper"], "action/arm, action/gripper"):
+        check(open_episodes(path, action_key=key, **SMALL)[0], old, 5)
+    [swapped] = open_episodes(path, action_key="gripper,arm", **SMALL)
+    np.testing.assert_array_equal(swapped.action[:, ::-1], old.action[:4])
+
+
+def test_a_folder_of_hdf5_files_is_read_in_numeric_order(tmp_path):
+    for i in (0, 2, 10):
+        old = [chain(5 + i, i)]
+        save(tmp_path / f"part_{i}.h5", rows(old) | {"terminals": last(old)})
+    assert [len(t) for t in open_episodes(tmp_path, **SMALL)] == [4, 6, 14]
+
+
+# OGBench: rows in an .npz
+
+
+def save_ogbench(path, trajectories):
+    """Rows of T + 1 observations; the action of an episode's last row means nothing."""
+    pad = np.full((1, 2), 0.9, np.float32)
+    np.savez_compressed(
+        path,
+        observations=np.concatenate([t.image for t in trajectories]),
+        actions=np.concatenate([np.concatenate([t.action, pad]) for t in trajectories]),
+        terminals=np.concatenate([np.arange(len(t) + 1) == len(t) for t in trajectories]),
+        qpos=np.zeros((sum(len(t) + 1 for t in trajectories), 9)),
+    )
+
+
+def test_ogbench_rows_are_read_in_any_order(tmp_path):
+    old = [chain(5, 0), chain(70, 1), chain(3, 2)]
+    save_ogbench(tmp_path / "visual-cube-single-play-v0.npz", old)
+    for source in (tmp_path, tmp_path / "visual-cube-single-play-v0.npz"):
+        assert recognise(source) == "npz"
+        episodes = open_episodes(source, **SMALL)
+        for i in (0, 1, 2, 1, 0):
+            check(episodes[i], old[i])
+
+
+def test_a_damaged_npz_of_rows_is_named(tmp_path):
+    save_ogbench(tmp_path / "a.npz", [chain(50)])
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    content[200:260] = bytes(60)
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.npz"):
+        open_episodes(tmp_path, "npz", **SMALL)[0]
+
+
+def test_npz_files_that_are_no_episodes_are_skipped_with_a_warning(tmp_path):
+    np.savez(tmp_path / "evaluations.npz", timesteps=np.arange(3), results=np.zeros((3, 5)))
+    save_ogbench(tmp_path / "a.npz", [chain(5)])
+    with pytest.warns(UserWarning, match=r"1 \.npz files without actions .* skipped, eva"):
+        assert len(open_episodes(tmp_path, **SMALL)) == 1
+
+
+def test_npz_keys_can_be_named(tmp_path):
+    old = chain(5)
+    action = np.concatenate([np.zeros((1, 2), np.float32), old.action])
+    np.savez(
+        tmp_path / "a.npz", rgb=old.image, arm=action[:, :1], hand=action[:, 1], over=[0] * 5 + [1]
+    )
+    keys = {"image_key": "rgb", "action_key": "arm,hand", "done_key": "over"}
+    [new] = open_episodes(tmp_path, **keys, **SMALL)
+    check(new, old)
+    assert new.terminated
+
+
+# Diffusion Policy: zarr
+
+
+def save_zarr(path, trajectories, dtype=np.uint8, version=2):
+    """data/img as floats in 0 .. 255 (PushT), data/action, meta/episode_ends."""
+    zarr = pytest.importorskip("zarr")
+    group = zarr.open_group(str(path), mode="w", zarr_format=version)
+    arrays = {
+        "data/img": np.concatenate([t.image[:-1] for t in trajectories]).astype(dtype),
+        "data/action": np.concatenate([256 + 256 * t.action for t in trajectories]),
+        "data/state": np.zeros((sum(map(len, trajectories)), 5), np.float32),
+        "meta/episode_ends": np.cumsum([len(t) for t in trajectories]),
+    }
+    for name, array in arrays.items():
+        group.create_array(name, data=array)
+
+
+@pytest.mark.parametrize(("dtype", "version"), [(np.float32, 2), (np.uint8, 3)])
+def test_zarr_rows_end_at_episode_ends(tmp_path, dtype, version):
+    old = [chain(5, 0), chain(7, 1), chain(2, 2)]
+    save_zarr(tmp_path / "pusht.zarr", old, dtype, version)
+    assert recognise(tmp_path / "pusht.zarr") == "zarr"
+    with pytest.raises(ValueError, match=r"dimension . runs from .* low=\[.*\], high=\[.*--low="):
+        open_episodes(tmp_path / "pusht.zarr", **SMALL)[0]
+    new = list(open_episodes(tmp_path / "pusht.zarr", low=0, high=512, **SMALL))
+    for found, expected in zip(new, old, strict=True):
+        check(found, expected, len(expected))
+    assert new[0].bounds.tolist() == [[0, 0], [512, 512]]
+
+
+def test_a_zarr_group_that_is_damaged_is_named(tmp_path):
+    save_zarr(tmp_path / "a.zarr", [chain(5)], version=3)
+    (tmp_path / "a.zarr" / "zarr.json").write_text("{")
+    with pytest.raises(ValueError, match=r"a\.zarr cannot be read as a zarr group"):
+        open_episodes(tmp_path / "a.zarr", "zarr")
+
+
+# TD-MPC2: torch
+
+
+def save_tdmpc2(path, trajectories, pickled=False):
+    """(E, T + 1, ...), the first action NaN."""
+    import torch
+
+    nan = np.full((1, 2), np.nan, np.float32)
+    images = np.stack([t.image.transpose(0, 3, 1, 2) for t in trajectories])
+    actions = np.stack([np.concatenate([nan, t.action]) for t in trajectories])
+    content = {"obs": torch.from_numpy(images), "action": torch.from_numpy(actions)}
+    torch.save(content | ({"made": Made()} if pickled else {}), path)
+
+
+class Made:
+    """Something that only a pickle can hold."""
+
+
+def test_tdmpc2_actions_lead_to_the_observation_and_are_shifted_back(tmp_path):
+    old = [chain(5, 0), chain(5, 1)]
+    save_tdmpc2(tmp_path / "chunk_0.pt", old)
+    save_tdmpc2(tmp_path / "chunk_1.pt", [replace(old[0], action=old[0].action)])
+    new = list(open_episodes(tmp_path, "tdmpc2", **SMALL))
+    for found, expected in zip(new, [*old, old[0]], strict=True):
+        check(found, expected)
+
+
+def test_a_pickle_of_tdmpc2_is_loaded_by_those_who_trust_it_only(tmp_path):
+    save_tdmpc2(tmp_path / "chunk_0.pt", [chain(5)], pickled=True)
+    with pytest.raises(ValueError, match=r"pickle of more than tensors .*trust=True \(--trust\)"):
+        open_episodes(tmp_path / "chunk_0.pt", "tdmpc2", **SMALL)
+    check(open_episodes(tmp_path / "chunk_0.pt", "tdmpc2", trust=True, **SMALL)[0], chain(5))
+
+
+def test_states_of_tdmpc2_are_refused_as_states(tmp_path):
+    import torch
+
+    torch.save({"obs": torch.zeros(4, 11, 24), "action": torch.zeros(4, 11, 6)}, tmp_path / "a.pt")
+    with pytest.raises(ValueError, match=r"are \(11, 24\) float32, .*render the states"):
+        open_episodes(tmp_path / "a.pt", "tdmpc2")[0]
+
+
+def test_a_door_for_each_format_converts(tmp_path):
+    old = [chain(5, 0)]
+    save_robomimic(tmp_path / "a.hdf5", old)
+    save_zarr(tmp_path / "b.zarr", old)
+    save_tdmpc2(tmp_path / "c.pt", old)
+    for form, name, options in (
+        ("hdf5", "a.hdf5", {}),
+        ("zarr", "b.zarr", {"low": 0, "high": 512}),
+        ("tdmpc2", "c.pt", {}),
+    ):
+        door = getattr(TrajectoryDataset, f"from_{form}")
+        dataset = door(tmp_path / name, tmp_path / form, **options, **SMALL)
+        np.testing.assert_allclose(dataset[0].action, old[0].action[: len(dataset[0])], atol=1e-6)

@@ -1,0 +1,153 @@
+"""The words by which files of rows name their arrays, and how a user's key finds one of them."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+IMAGES = ("observations", "observation", "obs", "images", "image", "pixels", "img")
+ACTIONS = ("actions", "action")
+REWARDS = ("rewards", "reward")
+# The flags by which a row may say that its action was an episode's last.
+TERMINAL = ("terminals", "terminations", "terminated", "terminal")  # the task ended
+TIMEOUT = ("timeouts", "truncations", "truncated", "timeout")  # the time limit was reached
+EITHER = ("dones", "done")
+ENDS = (*TERMINAL, *TIMEOUT, *EITHER, "step_type", "episode_ends")
+# Where known programs keep their cameras. Others are named by the user.
+CAMERAS = re.compile(r"(observations/images/.*|obs/.*_(image|rgb)|(img|camera_?\d+(_rgb)?))")
+MAIN_CAMERAS = ("agentview_image", "agentview_rgb")  # robomimic's and LIBERO's view of the scene
+
+Table = Mapping[str, Any]  # arrays by name: of NumPy, h5py or zarr
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Which arrays make an episode."""
+
+    image: str
+    actions: tuple[str, ...]
+    reward: str | None
+    next_image: str | None
+    others: tuple[str, ...] = field(default=(), compare=False)  # cameras that were not chosen
+
+
+def leaf(name: str) -> str:
+    """The last part of a path."""
+    return name.rsplit("/", 1)[-1]
+
+
+def match(key: str, names: Iterable[str]) -> str | None:
+    """The name that `key` means: itself, or the only one that ends with it."""
+    names = list(names)
+    if key in names:
+        return key
+    ending = [n for n in names if n.endswith("/" + key) and not n.startswith("next_")]
+    return ending[0] if len(ending) == 1 else None
+
+
+def first(words: Iterable[str], names: Iterable[str]) -> str | None:
+    """The first of `words` that is a name."""
+    names = set(names)
+    return next((word for word in words if word in names), None)
+
+
+def count(array: Any) -> int:
+    """The number of rows; not every library's arrays have a `len`."""
+    return int(array.shape[0]) if array.shape else 0
+
+
+def is_images(array: Any) -> bool:
+    """Whether an array has the shape of images: (N, H, W, C) or (N, C, H, W), or grayscale."""
+    return len(array.shape) == 4 or (len(array.shape) == 3 and array.dtype == np.uint8)
+
+
+def find_keys(table: Table, image_key: str | None, action_keys: tuple[str, ...]) -> Keys:
+    """Find images, actions and rewards by the user's keys, or by the usual words.
+
+    :raises ValueError: they are not there, or not unique; names what is there
+    """
+    image, others = _find_images(table, image_key)
+    head, _, tail = image.partition("/")
+    next_image = f"next_{head}/{tail}" if tail else f"next_{head}"
+    return Keys(
+        image,
+        find_actions(table, action_keys),
+        first(REWARDS, table),
+        next_image if next_image in table else None,
+        others,
+    )
+
+
+def find_actions(table: Table, action_keys: tuple[str, ...]) -> tuple[str, ...]:
+    """The names of the arrays of actions, in the order of the keys.
+
+    :raises ValueError: one is not there; names what might be meant
+    """
+    if not action_keys:
+        name = first(ACTIONS, table)
+        if name is None:
+            parts = [n for n in table if re.match(r"actions?([/_]|$)", n)]
+            what = f"give action_key, one or several of: {', '.join(parts or table)}"
+            raise ValueError(f"there is no array 'actions' or 'action'; {what} (--action-key)")
+        return (name,)
+    found = [match(key, table) for key in action_keys]
+    if None in found:
+        missing = action_keys[found.index(None)]
+        raise ValueError(f"there is no array {missing!r} of actions; there are: {', '.join(table)}")
+    return tuple(name for name in found if name is not None)
+
+
+def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, ...]]:
+    pictures = [name for name, array in table.items() if is_images(array)]
+    pictures = [name for name in pictures if not name.startswith("next_")]
+    there = f"there are images in: {', '.join(pictures)}" if pictures else "there are no images"
+    ask = f"{there}; give image_key (--image-key)" if pictures else f"{there}; render the states"
+    if image_key is not None:
+        name = match(image_key, table)
+        if name is None:
+            raise ValueError(f"needs an array {image_key!r}; there are: {', '.join(table)}. {ask}")
+        return name, ()
+    name = first(IMAGES, table)
+    if name is not None and (name in pictures or name not in IMAGES[:3] or not pictures):
+        return name, ()
+    if name is not None:
+        array = table[name]
+        raise ValueError(f"{name!r} is {array.shape} {array.dtype}, not images; {ask}")
+    cameras = [name for name in pictures if CAMERAS.fullmatch(name)]
+    main = [name for name in cameras if leaf(name) in MAIN_CAMERAS]
+    for choice in (cameras, main):
+        if len(choice) == 1:
+            return choice[0], tuple(name for name in cameras if name != choice[0])
+    raise ValueError(f"the images are under no usual name; {ask}")
+
+
+def natural(name: object) -> list[tuple[int, str | int]]:
+    """A key to sort by in which demo_2 comes before demo_10."""
+    parts = re.split(r"(\d+)", str(name))
+    return [(1, int(part)) if part.isdigit() else (0, part) for part in parts]
+
+
+def by_group(table: Table, action_keys: tuple[str, ...]) -> dict[str, Table]:
+    """The tables of groups that are an episode each, such as data/demo_0, in numeric order.
+
+    Such a group has a number at its end and holds actions.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    for name, array in table.items():
+        found = re.match(r"((?:[^/]*\D/)*[^/]*\d)/(.+)", name)
+        if found:
+            groups.setdefault(found[1], {})[found[2]] = array
+    wanted = [leaf(key) for key in action_keys] or list(ACTIONS)
+    holding = [
+        group
+        for group, arrays in groups.items()
+        if any(leaf(name) in wanted or name.split("/")[0] in wanted for name in arrays)
+    ]
+    return {group: groups[group] for group in sorted(holding, key=natural)}
+
+
+def within(key: str, groups: Iterable[str]) -> str:
+    """A key without the group it begins with: what names an array of demo_0 is meant for all."""
+    return next((key[len(g) + 1 :] for g in groups if key.startswith(g + "/")), key)

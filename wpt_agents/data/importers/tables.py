@@ -1,0 +1,158 @@
+"""Files of arrays, HDF5 or zarr: flat rows, a group per episode, or a file per episode."""
+
+import os
+import warnings
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wpt_agents.data.importers import rows
+from wpt_agents.data.importers.episodes import Episodes, warn_left_out
+from wpt_agents.data.importers.keys import (
+    ENDS,
+    Keys,
+    Table,
+    by_group,
+    count,
+    find_keys,
+    first,
+    within,
+)
+from wpt_agents.data.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an episode is: a file, a group in it, and rows; None for the whole group."""
+
+    file: Path
+    group: str
+    bounds: tuple[int, int] | None
+    keys: Keys
+    shifted: bool | None
+    task: str | None
+
+
+class TableEpisodes(Episodes):
+    """The episodes of files of arrays, file by file.
+
+    :param path: a file, or a folder whose files are read in their numeric order
+    :param shifted: whether row t holds the action that led to observation t, as in dm_env's
+        convention, and not the one that was taken at it; found out for `step_type` if None
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], shifted: bool | None = None, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self._root = Path(path)
+        self._shifted = shifted
+        self._opened: tuple[Path, Table] | None = None
+        self._places: list[Place] = []
+        self._chosen: set[str] = set()
+        left_out = 0
+        files = self._list(self._root)
+        for file in files:
+            try:
+                left_out += self._find(file, several=len(files) > 1)
+            except ValueError as error:
+                name = "" if str(error).startswith(str(file)) else f"{file}: "
+                raise ValueError(f"{name}{error}") from error
+        warn_left_out(left_out, path)
+
+    def _list(self, path: Path) -> Sequence[Path]:
+        """The files to read.
+
+        :raises ValueError: there are none
+        """
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
+        return [path]
+
+    @abstractmethod
+    def _read(self, file: Path) -> Table:
+        """All arrays of a file by their paths in it."""
+
+    def _task(self, file: Path) -> str | None:
+        """The task of a file's episodes, if the file says it."""
+        return None
+
+    def _table(self, file: Path) -> Table:
+        if self._opened is None or self._opened[0] != file:
+            self._opened = file, self._read(file)
+        return self._opened[1]
+
+    def _find(self, file: Path, several: bool) -> int:
+        """Add the places of a file's episodes; the number of those that hold no action."""
+        table = self._table(file)
+        task = self._task(file)
+        groups = by_group(table, self.action_keys)
+        if groups:
+            return self._find_groups(file, groups, task)
+        found = find_keys(table, self.image_key, self.action_keys)
+        self._say_camera(found)
+        flags = self.done_key is not None or first(ENDS, table) is not None
+        one_more = count(table[found.image]) == count(table[found.actions[0]]) + 1
+        alone = several or found.image.startswith("observations/images/") or one_more
+        if not flags and alone:
+            self._places.append(Place(file, "", None, found, self._shifted, task))
+            return 0
+        cut = rows.cut(table, found, self.done_key, self._shifted)
+        for bounds in cut.bounds:
+            self._places.append(Place(file, "", bounds, found, cut.shifted, task))
+        return cut.left_out
+
+    def _find_groups(self, file: Path, groups: dict[str, Table], task: str | None) -> int:
+        image_key = None if self.image_key is None else within(self.image_key, groups)
+        action_keys = tuple(within(key, groups) for key in self.action_keys)
+        left_out = 0
+        for group, table in groups.items():
+            try:
+                found = find_keys(table, image_key, action_keys)
+            except ValueError as error:
+                raise ValueError(f"{file} in {group}: {error}") from error
+            self._say_camera(found)
+            if count(table[found.image]) < 2 and found.next_image is None:
+                left_out += 1
+            else:
+                self._places.append(Place(file, group, None, found, self._shifted, task))
+        return left_out
+
+    def _say_camera(self, found: Keys) -> None:
+        if found.others and found.image not in self._chosen:
+            self._chosen.add(found.image)
+            warnings.warn(
+                f"{self._root}: of several cameras {found.image!r} is taken; image_key "
+                f"(--image-key) chooses another: {', '.join(found.others)}",
+                stacklevel=4,
+            )
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        place = self._places[i]
+        table = self._table(place.file)
+        if place.group:
+            table = {
+                name[len(place.group) + 1 :]: array
+                for name, array in table.items()
+                if name.startswith(place.group + "/")
+            }
+        name = place.file.name if place.file == self._root else self._relative(place.file)
+        if place.bounds is None:
+            source = f"{name} {place.group}" if place.group else name
+            episode = rows.whole(table, place.keys, source, place.shifted)
+        else:
+            start, stop = place.bounds
+            source = f"{name} rows {start} to {stop - 1}"
+            episode = rows.episode(table, place.keys, start, stop, bool(place.shifted))
+        image, action, reward, terminated = episode
+        return self._trajectory(
+            image, action, reward, source, terminated=terminated, task=self.task or place.task
+        )
+
+    def _relative(self, file: Path) -> str:
+        return file.relative_to(self._root).as_posix()

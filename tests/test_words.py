@@ -34,15 +34,10 @@ YET_TO_REWRITE = {
     "wpt_agents/data/importers",
     "wpt_agents/files",
     "wpt_agents/training",
-    "wpt_agents/zoo",
     "wpt_agents/zoo/bench",
     "wpt_agents/zoo/collect",
-    "wpt_agents/zoo/commands",
     "wpt_agents/zoo/judge",
     "wpt_agents/zoo/pictures",
-    "wpt_agents/zoo/plan",
-    "wpt_agents/zoo/report",
-    "wpt_agents/zoo/run",
 }
 ALLOWED = {"tests/test_words.py"}  # it has to name the words
 

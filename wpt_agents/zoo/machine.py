@@ -31,10 +31,10 @@ def check_machine(engine: str, device: str) -> None:
 def check_device(device: str) -> None:
     """Refuses a device that torch does not find; SB3 would take the CPU without a word."""
     try:
-        wanted = torch.device("cpu" if device == "auto" else device)
+        target = torch.device("cpu" if device == "auto" else device)
     except RuntimeError:
         raise ValueError(f"--device {device}: write auto, cpu, cuda, or cuda:1") from None
-    if wanted.type == "cuda" and (wanted.index or 0) >= torch.cuda.device_count():
+    if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
         raise ValueError(
             f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
             "GPUs here; take --device cpu, or a build of torch with CUDA and a driver"

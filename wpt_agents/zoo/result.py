@@ -251,7 +251,7 @@ def _score(stored: Mapping[str, Any]) -> Score:
 def _from_json(stored: dict[str, Any]) -> Result:
     """Build a result from a file of this version or of version 0.1.
 
-    In version 0.1 "preset" held the whole name of the variant, and the policies "last" and "best"
+    In version 0.1 "preset" was the whole name of the variant, and the policies "last" and "best"
     were called "WPT", or "WPT, last" and "WPT".
     """
     if "changes" in stored:

@@ -63,7 +63,7 @@ def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
 
 
 def resample(scores: Scores, draws: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """The stratified bootstrap: each stratum drawn anew from itself, (draws, n) a stratum."""
+    """The stratified bootstrap: draw each stratum from itself, (draws, n) for each one."""
     return [s[rng.integers(len(s), size=(draws, len(s)))] for s in scores]
 
 
@@ -75,7 +75,7 @@ def resamplable(scores: Scores) -> bool:
 def bootstrap(
     statistic: Callable[..., np.ndarray], *groups: Scores, draws: int = DRAWS, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The 95 % percentile interval of `statistic(*groups)`, each group resampled by itself.
+    """The 95 % percentile interval of `statistic(*groups)`, each group resampled separately.
 
     :param groups: each a sequence of (n,) strata
     :return: lower and upper end, each of the statistic's shape

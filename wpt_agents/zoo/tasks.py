@@ -19,7 +19,7 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
         raise unknown_name("suite", suite, suites)
     if not patterns:
         return table.suite(suite) or table.suite(suite, paper_only=False)
-    found: dict[str, Task] = {}
+    matches: dict[str, Task] = {}
     for pattern in patterns:
         name = pattern.removeprefix("wpt/").removesuffix("-v0")
         where = next((s for s in suites if name.startswith(f"{s}-")), suite)
@@ -36,8 +36,8 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
             )
         if not matching:
             raise unknown_name(f"task in suite {where!r} called", name, rows)
-        found |= matching
-    return list(found.values())
+        matches |= matching
+    return list(matches.values())
 
 
 def short_name(task: Task) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -22,17 +23,18 @@ def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iter
     """A row a case: `grows` says along which axis, `ms_per_unit` what a unit of work costs."""
     torch.set_num_threads(threads)
     for row in policy.rows(quick, threads):
-        if row["what"] != "policy step":
-            continue
-        yield _per_unit(row, "environments", row["batch"])
+        measured = SimpleNamespace(**row)
+        if measured.what == "policy step":
+            yield _per_unit(row, "environments", measured.batch)
     seen: dict[tuple, list[dict]] = {}
     for grows, cases in (QUICK if quick else GRID).items():
         for case in cases:
             if case not in seen:
                 seen[case] = list(updates(*case, precision, 1 if quick else 3))
             for row in seen[case]:
-                units = row["gflop"] if grows == "size" else row["batch"] * row["length"]
-                yield _per_unit(row, grows, units)
+                measured = SimpleNamespace(**row)
+                images = measured.batch * measured.length
+                yield _per_unit(row, grows, measured.gflop if grows == "size" else images)
 
 
 def _per_unit(row: dict[str, Any], grows: str, units: float) -> dict[str, Any]:
@@ -63,7 +65,8 @@ def _lines(found: list[dict[str, Any]], name: str) -> dict[str, list[tuple[float
     key = {"size": "gflop", "length": "length"}.get(name, "batch")
     lines: dict[str, list[tuple[float, float]]] = {}
     for row in found:
-        if row["grows"] == name:
-            label = row["what"] if name != "environments" else row["size"]
-            lines.setdefault(label, []).append((row[key], row["ms_per_unit"]))
+        case = SimpleNamespace(**row)
+        if case.grows == name:
+            label = case.what if name != "environments" else case.size
+            lines.setdefault(label, []).append((row[key], case.ms_per_unit))
     return {label: sorted(points) for label, points in lines.items()}

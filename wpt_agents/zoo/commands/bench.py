@@ -93,9 +93,9 @@ def bench(
     for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
         try:
             module = importlib.import_module(f"wpt_agents.zoo.bench.{'peers' if peer else name}")
-            found = _show(str(name), _rows(module, options), as_json)
+            measured = _show(str(name), _rows(module, options), as_json)
             if plot:
-                module.plot(found, plot)
+                module.plot(measured, plot)
         except ImportError as error:
             if case != Case.all:
                 raise ValueError(
@@ -118,11 +118,11 @@ def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
 
 def _show(name: str, rows: Iterator[dict], as_json: bool) -> list[dict]:
     """Print the rows, as JSON as soon as each one is measured, and return them."""
-    found = []
+    measured = []
     for row in rows:
-        found.append(row)
+        measured.append(row)
         if as_json:
             typer.echo(json.dumps({"case": name, **row}))
     if not as_json:
-        print_table(name, found)
-    return found
+        print_table(name, measured)
+    return measured

@@ -180,7 +180,7 @@ def import_data(
     from wpt_agents.data.dataset import TrajectoryDataset
     from wpt_agents.data.importers.formats import open_episodes
 
-    options: dict[str, Any] = {
+    choices: dict[str, Any] = {
         "image_key": image_key,
         "action_key": action_key,
         "done_key": done_key,
@@ -192,7 +192,7 @@ def import_data(
         "high": _numbers("--high", high),
         "trust": trust or None,
     }
-    options = {name: value for name, value in options.items() if value is not None}
+    options = {name: value for name, value in choices.items() if value is not None}
     shared = {"embodiment": embodiment, "task": task, "rewards": rewards, "image_size": image_size}
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
@@ -262,8 +262,8 @@ def validate_data(
     dataset = TrajectoryDataset.open(folder)
     asked = len(dataset)
     damaged = dataset.validate(progress_bar=True, set_aside=set_aside)
-    for each in damaged:
-        typer.echo(f"trajectory {each.trajectory}: {each.reason}")
+    for item in damaged:
+        typer.echo(f"trajectory {item.trajectory}: {item.reason}")
     state = "set aside" if set_aside else "damaged"
     typer.echo(f"{asked} trajectories read, {len(damaged)} {state}")
     if damaged and not set_aside:
@@ -328,6 +328,6 @@ def show_retrieval(
     if not queries:
         chosen = datasets.spread(agent.dataset, 6)
         queries = [retrieval.query_of(agent.dataset, i) for i in chosen]
-    found = [retrieval.search(agent, each, number, own_robot) for each in queries]
-    retrieval.retrieval_sheet(out, agent.dataset, found)
+    results = [retrieval.search(agent, item, number, own_robot) for item in queries]
+    retrieval.retrieval_sheet(out, agent.dataset, results)
     typer.echo(f"Retrieval sheet: {out.resolve()}")

@@ -118,7 +118,7 @@ def judge_predictions(
 ) -> None:
     """Measure how well a world model predicts: its error by horizon, beside simple guesses.
 
-    Example: `python -m wpt_agents.zoo open-loop walker.zip data/held-out --out predictions`
+    Example: `python -m wpt_agents.zoo open-loop walker.zip data/unseen --out predictions`
     """
     from wpt_agents.agents.wpt import WPT
     from wpt_agents.data.dataset import TrajectoryDataset

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import yaml
@@ -108,8 +109,8 @@ def read_origin(folder: Path) -> Origin | None:
     if not path.exists():
         return None
     try:
-        config = yaml.safe_load(path.read_text())
-        env = EnvSettings.of("env", config["env"])
-        return Origin(config["task"], asdict(env), config.get("method", "wpt"))
-    except (yaml.YAMLError, KeyError, TypeError) as error:
+        config = SimpleNamespace(**yaml.safe_load(path.read_text()))
+        env = EnvSettings.of("env", config.env)
+        return Origin(config.task, asdict(env), getattr(config, "method", "wpt"))
+    except (yaml.YAMLError, AttributeError, TypeError) as error:
         raise ValueError(f"{path} is no run's configuration ({error!r})") from None

@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter, defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 from rich.table import Table
@@ -28,18 +29,19 @@ def data_table(dataset: TrajectoryDataset) -> Table:
 
 
 def _row(part: TrajectoryDataset) -> list[str]:
-    info, lengths = part.info(), part.lengths
+    info = SimpleNamespace(**part.info())
+    lengths = part.lengths
     span = f"{lengths.min()} to {lengths.max()}" if len(part) else "none"
     return [
         str(len({task for task in part.tasks if task is not None})),
         f"{len(part):,}",
-        f"{info['transitions']:,}",
-        ", ".join(str(width) for width in sorted(info["action_dims"])),
+        f"{info.transitions:,}",
+        ", ".join(str(width) for width in sorted(info.action_dims)),
         str(lengths[0]) if len(part) and lengths.min() == lengths.max() else span,
-        f"{info['with_reward']:,}",
-        f"{info['bytes'] / 2**20:,.1f}",
-        f"{info['bytes_per_image']:,.0f}",
-        f"{100 / max(info['compression'], 1e-9):.1f} %",
+        f"{info.with_reward:,}",
+        f"{info.bytes / 2**20:,.1f}",
+        f"{info.bytes_per_image:,.0f}",
+        f"{100 / max(info.compression, 1e-9):.1f} %",
     ]
 
 

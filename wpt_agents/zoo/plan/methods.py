@@ -92,14 +92,14 @@ class Method:
         """The section of `config.yaml` that holds the agent's keywords."""
         return self.agent.__name__.lower()
 
-    def settings(self, wpt: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    def settings(self, wpt: Mapping[str, Any], specific: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keywords that the agent is made with.
 
         :param wpt: the preset's section `wpt`
         :param own: the keywords of the agent's own sections
         """
         kept = {k: v for k, v in wpt.items() if self.shared is None or k in self.shared}
-        return {**kept, **own, **self.keywords}
+        return {**kept, **specific, **self.keywords}
 
     def takes(self, keyword: str) -> bool:
         """Return whether the agent's constructor has this keyword."""

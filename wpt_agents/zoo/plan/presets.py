@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Any, Self, get_type_hints
+from typing import Any, NamedTuple, Self, get_type_hints
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,10 +21,10 @@ class Section:
     """A part of a preset: a dataclass that refuses unknown keys and wrong types."""
 
     @classmethod
-    def of(cls, title: str, given: Mapping[str, Any]) -> Self:
+    def of(cls, title: str, values: Mapping[str, Any]) -> Self:
         """Builds the section `title` from what a YAML file or --set gives."""
         types = get_type_hints(cls)
-        for key, value in given.items():
+        for key, value in values.items():
             if key not in types:
                 raise unknown_name(f"{title} key", key, types)
             if not _fits(value, types[key]):
@@ -32,7 +32,7 @@ class Section:
                 raise ValueError(f"{title}.{key} must be of type {name}, got {value!r}.")
             if types[key] is int and value < 0:
                 raise ValueError(f"{title}.{key} must not be negative, got {value}.")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 def _fits(value: Any, kind: Any) -> bool:
@@ -79,7 +79,7 @@ class PretrainSettings(Section):
 class LearnSettings(Section):
     """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
 
-    `checkpoint_every` so many frames a killed run can go on from there; 0: only from the end.
+    A killed run resumes from the last multiple of `checkpoint_every` frames; 0: only from the end.
     With `train_freq: step` the environment has a process of its own and steps beside the updates;
     `overlap: false` keeps it in the learner's, which learns the same.
     """
@@ -150,17 +150,17 @@ class Preset:
         return {k: v for name in sections(agent) for k, v in self.agents.get(name, {}).items()}
 
     @classmethod
-    def of(cls, given: Mapping[str, Mapping[str, Any]]) -> Self:
+    def of(cls, values: Mapping[str, Mapping[str, Any]]) -> Self:
         """Builds a preset from the sections of a YAML file."""
         types = get_type_hints(cls)
-        for title, section in given.items():
+        for title, section in values.items():
             if title not in {*types, *AGENTS} - {"agents"}:
                 raise unknown_name("section", title, {*types, *AGENTS} - {"agents"})
             if not isinstance(section, Mapping):
                 raise ValueError(f"Section {title!r} must hold keys and values, got {section!r}.")
-        keywords = {t: dict(given.get(t, {})) for t in ("wpt", "plus")}
-        agents = {t: dict(s) for t, s in given.items() if t in AGENTS}
-        typed = {t: types[t].of(t, s) for t, s in given.items() if t not in {*keywords, *AGENTS}}
+        keywords = {t: dict(values.get(t, {})) for t in ("wpt", "plus")}
+        agents = {t: dict(s) for t, s in values.items() if t in AGENTS}
+        typed = {t: types[t].of(t, s) for t, s in values.items() if t not in {*keywords, *AGENTS}}
         return cls(**typed, wpt=keywords["wpt"], plus=keywords["plus"], agents=agents)
 
     @property
@@ -170,10 +170,10 @@ class Preset:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain dictionaries and lists, as `config.yaml` shows them."""
-        given = asdict(self)
-        del given["plus"]  # a run's `wpt` holds what of it applies
-        del given["agents"]  # a run's own section holds its agent's keywords
-        return given | {"collect": given["collect"] | {"tasks": list(self.collect.tasks)}}
+        values = asdict(self)
+        del values["plus"]  # a run's `wpt` holds what of it applies
+        del values["agents"]  # a run's own section holds its agent's keywords
+        return values | {"collect": values["collect"] | {"tasks": list(self.collect.tasks)}}
 
 
 def wpt_keywords() -> Mapping[str, Any]:
@@ -213,10 +213,17 @@ def suite_names() -> list[str]:
 
 def preset_names(suite: str) -> list[str]:
     """The names of a suite's presets, as they stand in its file."""
-    return list(_read_suite(suite)["presets"])
+    return list(_read_suite(suite).presets)
 
 
-def _read_suite(suite: str) -> dict[str, Any]:
+class SuiteFile(NamedTuple):
+    """The content of zoo/<suite>.yaml."""
+
+    default: Mapping[str, Any]
+    presets: Mapping[str, Any]
+
+
+def _read_suite(suite: str) -> SuiteFile:
     if suite not in suite_names():
         raise unknown_name("suite with presets", suite, suite_names())
     path = preset_folder() / f"{suite}.yaml"
@@ -226,7 +233,7 @@ def _read_suite(suite: str) -> dict[str, Any]:
         raise ValueError(f"{path} is not valid YAML: {error}") from None
     if not isinstance(content, dict) or set(content) != {"default", "presets"}:
         raise ValueError(f"{path} must hold the two sections `default` and `presets`.")
-    return content
+    return SuiteFile(**content)
 
 
 def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
@@ -235,13 +242,13 @@ def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
     :param settings: each "section.key=value", or "key=value" for a keyword of WPT
     """
     content = _read_suite(suite)
-    if name not in content["presets"]:
-        raise unknown_name(f"{suite} preset", name, content["presets"])
-    given: dict[str, dict[str, Any]] = {}
-    for part in (content["default"], content["presets"][name] or {}, *map(_setting, settings)):
+    if name not in content.presets:
+        raise unknown_name(f"{suite} preset", name, content.presets)
+    values: dict[str, dict[str, Any]] = {}
+    for part in (content.default, content.presets[name] or {}, *map(_setting, settings)):
         for title, section in part.items():
-            given[title] = {**given.get(title, {}), **(section or {})}
-    return Preset.of(given)
+            values[title] = {**values.get(title, {}), **(section or {})}
+    return Preset.of(values)
 
 
 def keywords(settings: Sequence[str], valid: Collection[str] | None = None) -> dict[str, Any]:
@@ -251,13 +258,13 @@ def keywords(settings: Sequence[str], valid: Collection[str] | None = None) -> d
     :raises ValueError: another name
     """
     names = wpt_keywords() if valid is None else valid
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for title, section in (pair for text in settings for pair in _setting(text).items()):
         for name in section:
             if title != "wpt" or name not in names:
                 raise unknown_name("keyword for --set", name, names)
-        given |= section
-    return given
+        values |= section
+    return values
 
 
 def _setting(text: str) -> dict[str, dict[str, Any]]:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -93,8 +94,8 @@ class Run:
     def keywords(self) -> dict[str, Any]:
         """The keywords of the agent, the method's own included."""
         plus = self.preset.plus if self.algorithm.plus else {}
-        own = self.preset.of_agent(self.algorithm.agent)
-        return self.algorithm.settings({**self.preset.wpt, **plus}, own)
+        specific = self.preset.of_agent(self.algorithm.agent)
+        return self.algorithm.settings({**self.preset.wpt, **plus}, specific)
 
     @property
     def full_keywords(self) -> Mapping[str, Any]:
@@ -106,23 +107,23 @@ class Run:
         """Whether the run needs trajectories of the task's own robot from the dataset."""
         if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
             return self.algorithm.needs_data
-        wpt = self.full_keywords
-        guided = ever(parse_schedule(wpt["guidance"]))
-        imitates = ever(parse_schedule(wpt["kickstart"], np.inf))
-        return bool(wpt["offline_ratio"]) or guided or imitates
+        wpt = SimpleNamespace(**self.full_keywords)
+        guided = ever(parse_schedule(wpt.guidance))
+        imitates = ever(parse_schedule(wpt.kickstart, np.inf))
+        return bool(wpt.offline_ratio) or guided or imitates
 
     @property
     def updates(self) -> int | None:
         """The updates that fine-tuning will make, within an episode's worth; None if unknown."""
-        wpt = self.full_keywords
-        if "update_every" in wpt:
-            return max(self.preset.steps - wpt["learning_starts"], 0) // wpt["update_every"]
+        agent = SimpleNamespace(**self.full_keywords)
+        if hasattr(agent, "update_every"):
+            return max(self.preset.steps - agent.learning_starts, 0) // agent.update_every
         if not issubclass(self.algorithm.agent, WPT):
             return None
-        if self.preset.steps < wpt["learning_starts"]:
+        if self.preset.steps < agent.learning_starts:
             return 0
-        earned = self.preset.steps * wpt["train_ratio"] / (wpt["batch_size"] * wpt["batch_length"])
-        return int(max(earned, wpt["actor_delay"]))
+        earned = self.preset.steps * agent.train_ratio / (agent.batch_size * agent.batch_length)
+        return int(max(earned, agent.actor_delay))
 
     @property
     def evaluation_seed(self) -> int:
@@ -136,8 +137,15 @@ class Run:
         data = {"data": self.shared.data_source} if self.data is not None else {}
         sections = self.preset.as_dict()
         del sections["wpt"]
-        own = {self.algorithm.section: self.keywords}
-        return {**names, "seed": self.seed, "preset": self.preset_name, **data, **sections, **own}
+        specific = {self.algorithm.section: self.keywords}
+        return {
+            **names,
+            "seed": self.seed,
+            "preset": self.preset_name,
+            **data,
+            **sections,
+            **specific,
+        }
 
 
 def parse_seeds(text: str) -> list[int]:

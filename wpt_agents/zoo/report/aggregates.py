@@ -127,7 +127,7 @@ def improvement(
     common = [task for task in ours if task in theirs]
     if not common:
         return None
-    groups = [[np.array(each[task]) for task in common] for each in (ours, theirs)]
+    groups = [[np.array(group[task]) for task in common] for group in (ours, theirs)]
     return estimate(probability_of_improvement, *groups), len(common)
 
 

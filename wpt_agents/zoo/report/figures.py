@@ -82,7 +82,7 @@ def lines(
     title: str,
     x_label: str,
     y_label: str,
-    given: Sequence[Line],
+    series: Sequence[Line],
     labels: Sequence[str],
     step: bool = False,
 ) -> str:
@@ -94,7 +94,7 @@ def lines(
     with matplotlib.rc_context(STYLE):
         figure, axes = _axes()
         how = "steps-post" if step else "default"
-        for line in given:
+        for line in series:
             colour = colour_of(line.label, labels)
             middle, low, high = line.band
             marker = "" if step else "o"
@@ -114,22 +114,22 @@ def lines(
 def bars(
     title: str,
     y_label: str,
-    given: Mapping[str, tuple[float, float | None, float | None]],
+    series: Mapping[str, tuple[float, float | None, float | None]],
     colours: Sequence[str],
 ) -> str:
     """A bar for each name, with its 95 % interval where it has one."""
     with matplotlib.rc_context(STYLE):
         figure, axes = _axes()
-        for place, (value, low, high) in enumerate(given.values()):
+        for place, (value, low, high) in enumerate(series.values()):
             axes.bar(place, value, 0.62, color=colours[place], alpha=0.85)
             if low is not None and high is not None:
                 error = [[max(value - low, 0)], [max(high - value, 0)]]
                 axes.errorbar(place, value, error, color=INK, capsize=3, lw=1)
-        texts = [f"{name}\n{value:.2f}" for name, (value, *_) in given.items()]
-        axes.set_xticks(range(len(given)), texts)
+        texts = [f"{name}\n{value:.2f}" for name, (value, *_) in series.items()]
+        axes.set_xticks(range(len(series)), texts)
         axes.set_title(title, wrap=True)
         axes.set(ylabel=y_label)
-        if not any(max(value, high or 0) > 0 for value, _, high in given.values()):
+        if not any(max(value, high or 0) > 0 for value, _, high in series.values()):
             axes.set_ylim(0, 1)  # nothing to see: an axis around 0 would look like a fault
         axes.grid(False, axis="x")
         return svg(figure, title)

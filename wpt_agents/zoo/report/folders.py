@@ -36,15 +36,15 @@ class Finished:
 
     def media(self) -> dict[str, str]:
         """Return video, predictions and retrieval as data URIs by their files' stems."""
-        found = {}
+        entries = {}
         if (video := self.folder / "policy.mp4").exists():
-            found["policy"] = data_uri("video/mp4", video.read_bytes())
+            entries["policy"] = data_uri("video/mp4", video.read_bytes())
         for name in ("predictions", "retrieval"):
             if (picture := self.folder / f"{name}.png").exists():
                 pixels = imageio.imread(picture)[..., :3]
                 small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
-                found[name] = data_uri("image/jpeg", small)
-        return found
+                entries[name] = data_uri("image/jpeg", small)
+        return entries
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return frames (N,) and scores (N, episodes), successes where the task counts them."""
@@ -103,9 +103,9 @@ def read_results(folder: Path) -> list[Result]:
 
 def find_unfinished(folder: Path) -> list[Unfinished]:
     """Return every run folder below `folder` that has no result yet."""
-    found = []
+    entries = []
     for path in sorted(folder.glob("**/config.yaml")):
         if not (path.parent / FILE).exists():
             error = path.parent / "error.txt"
-            found.append(Unfinished(path.parent, error.read_text() if error.exists() else ""))
-    return found
+            entries.append(Unfinished(path.parent, error.read_text() if error.exists() else ""))
+    return entries

@@ -69,7 +69,7 @@ def card(result: Result, name: str) -> str:
     """Return the model card: metadata for the hub, the scores of all policies, how to load it."""
     metric = result.metric
     value = {"type": metric, "name": f"mean {metric}", "value": result.counted()}
-    found = {
+    scored = {
         "task": {"type": "reinforcement-learning", "name": result.task},
         "dataset": {"type": result.suite, "name": result.task},
         "metrics": [value],
@@ -79,7 +79,7 @@ def card(result: Result, name: str) -> str:
         "library_name": "wpt-agents",
         "license": "mit",
         "tags": ["reinforcement-learning", "world-model", "stable-baselines3", result.task],
-        "model-index": [{"name": repository, "results": [found]}],
+        "model-index": [{"name": repository, "results": [scored]}],
     }
     rows = tables.policies([result])
     return _CARD.format(

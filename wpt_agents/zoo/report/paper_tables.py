@@ -126,13 +126,13 @@ def table_row(
         for c in columns
     ]
     if task in STATISTICS:
-        own: list[Cell | None] = [
+        our_cells: list[Cell | None] = [
             our_aggregate(task, [runs for (_, name), runs in cells.items() if name == column])
             for column in ours
         ]
     else:
-        own = [our_cell(cells.get((task, column), [])) for column in ours]
-    return TableRow(task, task in STATISTICS, paper, own)
+        our_cells = [our_cell(cells.get((task, column), [])) for column in ours]
+    return TableRow(task, task in STATISTICS, paper, our_cells)
 
 
 def shared_note(rows: Sequence[TableRow], place: int) -> str:

@@ -106,8 +106,8 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, Mea
         strata[suite] = [np.array(scores) for scores in tasks.values()]
         means[suite] = Means(len(tasks), _cell(strata[suite], mean))
     if len(strata) == 2:
-        every = [scores for each in strata.values() for scores in each]
-        ends = [0, *np.cumsum([len(each) for each in strata.values()])]
+        every = [scores for scores_of_tasks in strata.values() for scores in scores_of_tasks]
+        ends = [0, *np.cumsum([len(scores_of_tasks) for scores_of_tasks in strata.values()])]
 
         def both(scores: Scores) -> np.ndarray:
             return np.mean([mean(scores[a:b]) for a, b in pairwise(ends)], 0)

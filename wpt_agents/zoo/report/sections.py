@@ -171,7 +171,10 @@ def ablation(suite: str, experiments: Mapping[Experiment, Scores], names: Names)
     for one, tasks in experiments.items():
         if one.method in ABLATION:
             budgets[one.budget][one] = tasks
-    return "".join(draw_ablation(suite, budget, each, names) for budget, each in budgets.items())
+    return "".join(
+        draw_ablation(suite, budget, experiments_of, names)
+        for budget, experiments_of in budgets.items()
+    )
 
 
 def draw_ablation(

@@ -193,7 +193,7 @@ def _checksum(path: Path) -> str:
 
 
 class Checkpoints(BaseCallback):
-    """Writes a checkpoint between two episodes every so many steps, and at the end of learning.
+    """Writes a checkpoint every few steps, between two episodes, and at the end of learning.
 
     It also measures what learning costs, over all processes that took part in it in turn.
 

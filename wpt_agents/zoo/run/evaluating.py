@@ -41,13 +41,13 @@ def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:
 def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
     """Return the policies that the run has trained, by name."""
     prior: PolicyPredictor | None = getattr(agent, "prior", None)
-    found = {PRIOR_ACTOR: prior} if prior is not None else {}
+    trained = {PRIOR_ACTOR: prior} if prior is not None else {}
     for name, file in ((HEAD_START, HEAD_START_MODEL), (BEST, BEST_MODEL)):
         if (path := run.folder / file).exists():
-            found[name] = run.algorithm.agent.load(path, device=run.device)
+            trained[name] = run.algorithm.agent.load(path, device=run.device)
         if name == HEAD_START:
-            found[LAST] = agent
-    return found
+            trained[LAST] = agent
+    return trained
 
 
 def final_agent(run: Run, agent: BaseAlgorithm) -> BaseAlgorithm:

@@ -28,15 +28,15 @@ def check_folder(job: Run, force: bool) -> None:
     :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
     """
     path = job.folder / "config.yaml"
-    others = {each.name for each in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
+    others = {item.name for item in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
     if others and not path.exists():
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
         section = job.algorithm.section
         usual = {f"{section}.{k}": v for k, v in defaults(job.algorithm.agent).items()}
         before = usual | _flat(yaml.safe_load(path.read_text()))
-        wanted = usual | _flat(json.loads(json.dumps(job.config())))
-        differ = sorted(k for k in before.keys() | wanted if before.get(k) != wanted.get(k))
+        now = usual | _flat(json.loads(json.dumps(job.config())))
+        differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))
         if differ:
             raise ValueError(
                 f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
@@ -49,7 +49,7 @@ def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in config.items():
         if isinstance(value, dict):
-            flat |= {f"{name}.{key}": each for key, each in value.items()}
+            flat |= {f"{name}.{key}": item for key, item in value.items()}
         else:
             flat[name] = value
     return flat

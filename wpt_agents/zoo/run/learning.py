@@ -62,8 +62,8 @@ def make_agent(
         "episode_length": episode_steps(run.task.id, run.shared.env),
     }
     known = {name: value for name, value in task.items() if method.takes(name)}
-    own = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
-    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **own, **known}
+    specific = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
+    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **specific, **known}
     agent: Any = without_progress_bar(method.agent)
     if checkpoint is not None:
         return agent.load(checkpoint.model, env=venv, **keywords)

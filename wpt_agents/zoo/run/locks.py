@@ -10,7 +10,7 @@ from typing import IO, Any
 
 from wpt_agents.files.archive import replacing
 
-PATIENCE = 0.5  # seconds with a lock that is held: `zoo watch` looks at each for an instant
+PATIENCE = 0.5  # seconds to wait for a lock: `zoo watch` takes each one for an instant
 
 
 @contextmanager

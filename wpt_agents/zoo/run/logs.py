@@ -9,18 +9,18 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class Evaluations(EvalCallback):
-    """SB3's EvalCallback that goes on with its folder's evaluations, and with the best of them."""
+    """SB3's EvalCallback, which continues the evaluations of its folder and the best of them."""
 
     def _init_callback(self) -> None:
         super()._init_callback()
         path = Path(f"{self.log_path}.npz")
         if path.exists():
-            with np.load(path) as held:
-                self.evaluations_timesteps = held["timesteps"].tolist()
-                self.evaluations_results = held["results"].tolist()
-                self.evaluations_length = held["ep_lengths"].tolist()
+            with np.load(path) as arrays:
+                self.evaluations_timesteps = arrays["timesteps"].tolist()
+                self.evaluations_results = arrays["results"].tolist()
+                self.evaluations_length = arrays["ep_lengths"].tolist()
                 self.evaluations_successes = (
-                    held["successes"].tolist() if "successes" in held else []
+                    arrays["successes"].tolist() if "successes" in arrays else []
                 )
             self.best_mean_reward = float(np.mean(self.evaluations_results, 1).max())
         self.n_calls = self.model.num_timesteps // self.model.n_envs
@@ -48,7 +48,7 @@ class ContinuedCSV(CSVOutputFormat):
         self.keys = before.partition("\n")[0].split(",") if before else []
 
     def keep(self, rows: int) -> None:
-        """Drops all rows behind the first so many."""
+        """Keep the first `rows` rows and drop the others."""
         self.file.seek(0)
         lines = self.file.readlines()[: 1 + rows]
         self.file.seek(0)

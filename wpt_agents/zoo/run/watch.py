@@ -69,7 +69,7 @@ def read_monitor(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
     """Steps a second over the last episodes since the process began; None with fewer than two."""
-    begins = np.flatnonzero(np.diff(times) < 0)  # a resumed run's clock begins anew
+    begins = np.flatnonzero(np.diff(times) < 0)  # the clock of a resumed run begins at 0
     since = max(begins[-1] + 1 if len(begins) else 0, len(times) - RECENT)
     lengths, times = lengths[since:], times[since:]
     if len(times) < 2 or times[-1] <= times[0]:

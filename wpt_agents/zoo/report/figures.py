@@ -78,6 +78,11 @@ def colour_of(label: str, labels: Sequence[str]) -> str:
     return SERIES[list(labels).index(label) % len(SERIES)]
 
 
+def dashes_of(label: str, labels: Sequence[str]) -> str:
+    """Return a series' line style, which differs where more series than colours share a colour."""
+    return ("-", "--", ":")[list(labels).index(label) // len(SERIES) % 3]
+
+
 def lines(
     title: str,
     x_label: str,
@@ -98,7 +103,10 @@ def lines(
             colour = colour_of(line.label, labels)
             middle, low, high = line.band
             marker = "" if step else "o"
-            axes.plot(line.x, middle, color=colour, lw=1.8, marker=marker, ms=3, drawstyle=how)
+            style = dashes_of(line.label, labels)
+            axes.plot(
+                line.x, middle, style, color=colour, lw=1.8, marker=marker, ms=3, drawstyle=how
+            )
             axes.fill_between(
                 line.x, low, high, color=colour, alpha=0.18, lw=0, step="post" if step else None
             )

@@ -1,6 +1,9 @@
 """What the runner prints: the shared console, one line per stage, and progress bars."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from tqdm.auto import tqdm
@@ -21,3 +24,18 @@ def progress(
     return tqdm(
         total=total, initial=done, desc=label, unit=f" {unit}", mininterval=interval, disable=hide
     )
+
+
+@contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Append everything that is printed to a file, progress bars included."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    streams = sys.stdout, sys.stderr
+    with open(path, "a", buffering=1) as file:
+        sys.stdout = sys.stderr = file
+        console.file = file
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = streams
+            console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wpt_agents.zoo.commands.options import Rendering, Spaced, Suite, Tasks, Workers
+from wpt_agents.zoo.commands.retrieval import Picture, retrieve, show_retrieval
 
 if TYPE_CHECKING:
     from wpt_agents.data.dataset import TrajectoryDataset
 
 data = typer.Typer(no_args_is_help=True, help="Show, check and join datasets.")
-retrieve = typer.Typer(no_args_is_help=True, help="Show what retrieval finds.")
 Store = Annotated[Path, typer.Argument(help="The folder of a dataset.")]
-Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -283,51 +282,3 @@ def merge_data(
     from wpt_agents.data.dataset import TrajectoryDataset
 
     _print_summary(TrajectoryDataset.merge(out, folders))
-
-
-def show_retrieval(
-    folder: Store,
-    model: Annotated[Path, typer.Option(help="The model file whose encoder compares the images.")],
-    query: Annotated[
-        list[int], typer.Option(help="Numbers of trajectories of the dataset to search for.")
-    ] = [],  # noqa: B006
-    task: Annotated[
-        list[str],
-        typer.Option(help="Tasks whose first image to search for."),
-    ] = [],  # noqa: B006
-    suite: Suite = "dmc",
-    rendering: Annotated[
-        Rendering, typer.Option(help="The quality of the images of --task.")
-    ] = Rendering.near,
-    number: Annotated[
-        int, typer.Option(min=1, help="The number of nearest trajectories to show.")
-    ] = 8,
-    own_robot: Annotated[
-        bool,
-        typer.Option(
-            "--own-robot", help="Search only the query's robot and number of actions, as WPT does."
-        ),
-    ] = False,
-    out: Picture = Path("retrieval.png"),
-) -> None:
-    """Draw first images beside the trajectories with the most similar ones, with distances.
-
-    Without --query and --task, the queries are some trajectories of the dataset.
-
-    Example: `python -m wpt_agents.zoo retrieve show data/two --model m.zip --task walker-run`
-    """
-    from wpt_agents.agents.wpt import WPT
-    from wpt_agents.zoo.pictures import datasets, retrieval
-    from wpt_agents.zoo.tasks import find_tasks
-
-    agent = WPT.load(model, dataset=folder)
-    assert agent.dataset is not None
-    queries = [retrieval.query_of(agent.dataset, i) for i in query]
-    rows = find_tasks(suite, task) if task else []
-    queries += [retrieval.query_at(row, {"rendering": str(rendering)}) for row in rows]
-    if not queries:
-        chosen = datasets.spread(agent.dataset, 6)
-        queries = [retrieval.query_of(agent.dataset, i) for i in chosen]
-    results = [retrieval.search(agent, item, number, own_robot) for item in queries]
-    retrieval.retrieval_sheet(out, agent.dataset, results)
-    typer.echo(f"Retrieval sheet: {out.resolve()}")

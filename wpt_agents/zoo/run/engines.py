@@ -7,10 +7,9 @@ must be on a file system that all machines see. Ray and submitit are imported on
 
 import shutil
 import signal
-import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
@@ -30,7 +29,7 @@ from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.run.watch import shown
-from wpt_agents.zoo.terminal import console, say
+from wpt_agents.zoo.terminal import console, logged, say
 
 Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called repeatedly while waiting; takes a moment
@@ -110,21 +109,6 @@ def do(job: Run) -> None:
     """Do the work of a job: the run, with its output in the folder's `log.txt`."""
     with logged(job.folder / "log.txt"):
         runner.run(job)
-
-
-@contextmanager
-def logged(path: Path) -> Iterator[None]:
-    """Append everything that is printed to a file, progress bars included."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    streams = sys.stdout, sys.stderr
-    with open(path, "a", buffering=1) as file:
-        sys.stdout = sys.stderr = file
-        console.file = file
-        try:
-            yield
-        finally:
-            sys.stdout, sys.stderr = streams
-            console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"
 
 
 class Local:

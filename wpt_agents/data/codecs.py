@@ -1,4 +1,4 @@
-"""How the images of a block are kept: losslessly (zstd, raw), or as JPEG for noisy cameras."""
+"""The codecs of image blocks: lossless (zstd, raw), or JPEG for noisy cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class Codec:
-    """How to keep (n, S, S, 3) uint8 images and the bytes of a vector behind them.
+    """A way to store (n, S, S, 3) uint8 images, followed by the bytes of a vector.
 
-    :param encode: images and vector -> what is stored
-    :param decode: what is stored and the vector's bytes, in number -> the images' bytes, then the
-        vector's
+    :param encode: images and vector -> the stored bytes
+    :param decode: the stored bytes and the size of the vector -> the images' bytes, followed by
+        the vector's
     """
 
     encode: Callable[[np.ndarray, bytes], bytes]
@@ -27,7 +27,7 @@ class Codec:
 
 
 def _to_jpeg(images: np.ndarray, vector: bytes) -> bytes:
-    """One tall picture of all images: a header each would take a third more."""
+    """Encode one tall picture of all images: separate headers would take a third more space."""
     from PIL import Image
 
     stream = BytesIO()
@@ -54,7 +54,7 @@ CODECS = {
 
 
 def find_codec(name: str) -> Codec:
-    """The codec of this name.
+    """Return the codec of this name.
 
     :raises ValueError: there is none
     """

@@ -1,12 +1,12 @@
-"""What a dataset's folder says of itself: what was fixed, which trajectories, which are damaged.
+"""The index of a dataset's folder: its fixed properties, its trajectories, and the damaged ones.
 
 ::
 
     meta.json      kind, version, image size, codec; written once
-    index.jsonl    a line a trajectory: CRC-32, then JSON; one exists once its line does
-    damaged.json   where the trajectories stand that `validate` has set aside, if there are any
+    index.jsonl    one line per trajectory: CRC-32, then JSON; written after its blocks
+    damaged.json   the places of trajectories that `validate` has set aside, if there are any
 
-Nothing but appending ever happens to the index. Deleting damaged.json brings back what it names.
+The index is only ever appended to. Deleting damaged.json brings back the trajectories it names.
 """
 
 import json
@@ -21,12 +21,12 @@ from wpt_agents.files.archive import replacing
 KIND, VERSION = "wpt_agents.TrajectoryDataset", 1
 CONVERT_LOCK = "convert.lock"  # an empty file, locked by the process that converts into a cache
 
-Place = tuple[int, int]  # shard and offset, by which a trajectory is known for good
+Place = tuple[int, int]  # shard and offset, by which a trajectory is identified permanently
 
 
 @dataclass(frozen=True)
 class Meta:
-    """What is fixed when a dataset is made."""
+    """The properties that are fixed when a dataset is created."""
 
     image_size: int
     codec: str
@@ -36,8 +36,9 @@ class Meta:
 class Entry:
     """A trajectory's line in the index.
 
-    :param blocks: the blocks' sizes in bytes, in words: parsing 60,000 lists would take a second
-    :param checksum: CRC-32 of the blocks' own; None in datasets written before it was there
+    :param blocks: the blocks' sizes in bytes, separated by spaces: parsing 60,000 JSON lists
+        would take a second
+    :param checksum: CRC-32 of the blocks' own; None in datasets of older versions
     :param bounds: lowest and highest values of the actions in the robot's own units, if known
     """
 
@@ -65,16 +66,16 @@ class Entry:
         return [int(size) for size in self.blocks.split()]
 
     def line(self) -> bytes:
-        """The entry as the index holds it."""
+        """The entry as a line of the index."""
         known = {k: v for k, v in asdict(self).items() if v is not None and v is not False}
         record = json.dumps(known, separators=(",", ":")).encode()
         return b"%08x %s\n" % (zlib.crc32(record), record)
 
 
 def create_folder(path: Path, meta: Meta) -> None:
-    """Makes an empty dataset.
+    """Create an empty dataset.
 
-    :raises ValueError: no image size, or a folder with something in it
+    :raises ValueError: an image size that is not positive, or a folder that is not empty
     """
     if not 0 < meta.image_size:
         raise ValueError(f"image_size must be positive, got {meta.image_size}")
@@ -91,13 +92,13 @@ def create_folder(path: Path, meta: Meta) -> None:
 
 
 def _left_by_create(file: Path) -> bool:
-    """Whether the file is all that a `create_folder` killed halfway can have left."""
+    """Whether the file may be left over from a `create_folder` that was killed halfway."""
     empty = file.name in ("index.jsonl", CONVERT_LOCK) and file.stat().st_size == 0
     return empty or file.name.startswith(".meta.json.tmp-")
 
 
 def read_meta(path: Path) -> Meta:
-    """The dataset's fixed properties.
+    """Read the dataset's fixed properties.
 
     :raises ValueError: no dataset there, or one of a newer version
     """
@@ -121,7 +122,7 @@ def read_meta(path: Path) -> Meta:
 
 
 def read_index(path: Path) -> tuple[list[Entry], int]:
-    """All trajectories whose line is complete, and where the last complete line ends.
+    """Read all entries whose line is complete, and the offset at which the last one ends.
 
     :raises ValueError: no index, a complete line that does not match its checksum, or lines that
         are repeated or out of order
@@ -149,7 +150,7 @@ def read_index(path: Path) -> tuple[list[Entry], int]:
 
 
 def read_damaged(path: Path) -> dict[Place, str]:
-    """Where the trajectories stand that were set aside, and why.
+    """Read the places of the trajectories that were set aside, with the reasons.
 
     :raises ValueError: the list itself is damaged
     """
@@ -161,12 +162,12 @@ def read_damaged(path: Path) -> dict[Place, str]:
     except (json.JSONDecodeError, TypeError, KeyError) as error:
         raise ValueError(
             f"{path / 'damaged.json'} is damaged ({error!r}); delete it and let "
-            "validate(set_aside=True) write it anew"
+            "validate(set_aside=True) write it again"
         ) from error
 
 
 def add_damaged(path: Path, places: Mapping[Place, str]) -> None:
-    """Sets trajectories aside: whoever opens the folder from now on does not see them."""
+    """Set trajectories aside: readers who open the folder from now on do not see them."""
     known = {**read_damaged(path), **places}
     items = [{"shard": k[0], "at": k[1], "reason": known[k]} for k in sorted(known)]
     with replacing(path / "damaged.json") as temporary:
@@ -174,6 +175,6 @@ def add_damaged(path: Path, places: Mapping[Place, str]) -> None:
 
 
 def undamaged(path: Path, entries: Sequence[Entry]) -> list[Entry]:
-    """The entries that were not set aside."""
+    """Return the entries that were not set aside."""
     damaged = read_damaged(path)
     return [entry for entry in entries if entry.place not in damaged]

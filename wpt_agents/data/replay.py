@@ -21,9 +21,9 @@ LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 
 
 class ReplayBuffer:
-    """Whole episodes in memory; as many as there is memory for.
+    """Whole episodes in memory, without a capacity limit.
 
-    :ivar trajectories: what was added, in order; add with `add` only
+    :ivar trajectories: the episodes in the order of addition; change it through `add` only
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class ReplayBuffer:
         self._windows: Windows | None = None
 
     def add(self, trajectory: Trajectory) -> None:
-        """Appends one episode, which is kept as it is, not copied.
+        """Append one episode, without copying it.
 
         :raises ValueError: images of another size than those already here
         """
@@ -53,7 +53,7 @@ class ReplayBuffer:
     def sample(
         self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
     ) -> Batch:
-        """Windows drawn by the rule of `wpt_agents.data.windows`.
+        """Draw a batch by the rule of `wpt_agents.data.windows`.
 
         :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
         """
@@ -61,7 +61,7 @@ class ReplayBuffer:
         return _batch_of(self.trajectories, rows, action_width)
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
-        """Which pieces `sample` would copy."""
+        """Draw the pieces that `sample` copies."""
         if not self.trajectories:
             raise ValueError("The replay buffer is empty; add a trajectory before sampling")
         if self._windows is None:
@@ -76,7 +76,7 @@ class ReplayBuffer:
         return [[(before + i, start, stop) for i, start, stop in row] for row in rows]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one file (arrays and JSON, no pickle), whole or not at all."""
+        """Write one file (arrays and JSON, no pickle) atomically."""
         episodes = [{k: getattr(t, k) for k in LABELS} for t in self.trajectories]
         arrays = {
             f"{i}/{name}": getattr(trajectory, name)
@@ -88,7 +88,7 @@ class ReplayBuffer:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ReplayBuffer":
-        """Reads what `save` wrote.
+        """Read a file of `save`.
 
         :raises ValueError: a file that is cut short, damaged, or not a replay buffer
         """
@@ -112,7 +112,7 @@ def mix(
 ) -> Batch:
     """Experience rehearsal: a batch of `online`, then `batch_size * ratio` rows of `retrieved`.
 
-    The rewards of `retrieved` are of other tasks or of none, so they are hidden.
+    The rewards of `retrieved` belong to other tasks or to none, so they are masked.
 
     :param recent_share: share of the online rows that come from the newest episodes, which uniform
         replay shows least often

@@ -55,7 +55,7 @@ class Retriever:
         encoder_id: str,
         progress_bar: bool = False,
     ) -> "Retriever":
-        """Embeds the first image of every trajectory.
+        """Embed the first image of every trajectory.
 
         :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
         """
@@ -82,9 +82,9 @@ class Retriever:
         encoder_id: str,
         progress_bar: bool = False,
     ) -> "Retriever":
-        """The index that stands beside the dataset; built and saved if missing or out of date.
+        """Load the index in the dataset's folder; build and save it if missing or out of date.
 
-        A subset's is built each time, since the folder's is of the whole dataset.
+        The index of a subset is built each time, since the folder holds that of the whole dataset.
         """
         path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
         whole = not dataset.is_subset
@@ -144,14 +144,14 @@ class Retriever:
         embodiment: str | None = None,
         action_dim: int | None = None,
     ) -> np.ndarray:
-        """What `search` chooses from, chosen blindly: `k` indices, each trajectory once."""
+        """Draw `k` of the candidates of `search` at random, without replacement."""
         candidates = self._candidates(embodiment, action_dim)
         return rng.permutation(candidates)[:k]
 
     def own_share(self, k: int = 10, queries: int = 100) -> float | None:
-        """How well the features tell robots apart, without their names or widths to help.
+        """Measure how well the features alone distinguish robots.
 
-        :param queries: named trajectories to ask for, evenly spread, all if there are fewer
+        :param queries: how many named trajectories to search for, evenly spread
         :return: the share of their `k` nearest named others that are of the same name; None where
             fewer than two robots are named
         """
@@ -175,7 +175,7 @@ class Retriever:
         return np.flatnonzero(wanted)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one file, whole or not at all."""
+        """Write one file atomically."""
         about = {
             "encoder_id": self.encoder_id,
             "dataset_id": self.dataset_id,
@@ -186,7 +186,7 @@ class Retriever:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], encoder_id: str) -> "Retriever":
-        """Reads what `save` wrote.
+        """Read a file of `save`.
 
         :raises ValueError: an index of another encoder, or a damaged file
         """

@@ -1,14 +1,14 @@
-"""The folder a dataset is kept in: written trajectory by trajectory, read block by block.
+"""The shards of a dataset: written trajectory by trajectory, read block by block.
 
 ::
 
     index.jsonl       see `wpt_agents.data.index`
-    shard-00000.bin   blocks of 16 steps, each compressed by itself and followed by its CRC-32
+    shard-00000.bin   blocks of 16 steps, compressed separately, each followed by its CRC-32
 
 A block holds the images of 16 steps, then the actions taken at them, then their rewards. A line is
-appended to the index after its blocks are on the disk, so a writer killed at any moment leaves at
-most bytes that no line speaks of, and the next writer removes them. A writer excludes others;
-readers need no lock.
+appended to the index after its blocks are on the disk. So a writer that is killed at any moment
+leaves at most bytes without a line, which the next writer removes. Only one writer can hold the
+lock; readers need none.
 """
 
 import os
@@ -26,12 +26,12 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.files.archive import sync_folder
 from wpt_agents.files.locks import lock, unlock
 
-BLOCK = 16  # steps; longer compresses little better and makes a window's edges dearer
+BLOCK = 16  # steps; longer blocks compress little better and make sequences read more in vain
 SHARD_BYTES = 256 * 2**20
 
 
 def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[memoryview]:
-    """The blocks `first` to `last`, `last` included, as they are stored, CRC-32 and all.
+    """Yield the stored blocks `first` to `last` (inclusive), with their CRC-32.
 
     :raises OSError: a block that cannot be read or does not match its checksum
     """
@@ -56,7 +56,7 @@ def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[mem
 def read_steps(
     path: Path, meta: Meta, entry: Entry, first: int, last: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The images, actions and rewards of the blocks `first` to `last`, `last` included.
+    """Read images, actions and rewards of the blocks `first` to `last` (inclusive).
 
     :raises OSError: a block that cannot be read or does not match its checksum
     """
@@ -98,9 +98,9 @@ def _decode(
 
 
 class Writer:
-    """Appends trajectories to a folder; one at a time has the right to.
+    """Appends trajectories to a folder; it holds the write lock until it is closed.
 
-    :ivar entries: the trajectories that were there when the writing began
+    :ivar entries: the trajectories that existed when the writer was made
     :raises ValueError: another writer is at work, or a damaged index
     """
 
@@ -125,7 +125,7 @@ class Writer:
             raise
 
     def append(self, trajectory: Trajectory) -> Entry:
-        """Writes the blocks, then the line; what fails halfway leaves the dataset as it was."""
+        """Write the blocks, then the line; a failure halfway leaves the dataset unchanged."""
         labels = Entry(
             shard=0,
             at=0,
@@ -142,7 +142,7 @@ class Writer:
         return self._add(_encode(trajectory, self._meta), labels)
 
     def copy(self, blocks: Iterable[bytes | memoryview], entry: Entry) -> Entry:
-        """Adds a trajectory of another folder of the same Meta, as `read_blocks` gives it."""
+        """Add a trajectory of another folder with the same Meta, from its stored blocks."""
         return self._add(blocks, entry)
 
     def _add(self, blocks: Iterable[bytes | memoryview], labels: Entry) -> Entry:
@@ -174,11 +174,11 @@ class Writer:
         return entry
 
     def flush(self) -> None:
-        """Makes what was appended survive a power cut."""
+        """Force the index to the disk, so that what was appended survives a power cut."""
         os.fsync(self._index.fileno())
 
     def close(self) -> None:
-        """Gives the right to write back."""
+        """Release the write lock."""
         self.flush()
         self._shard.close()
         unlock(self._index.fileno())
@@ -197,6 +197,6 @@ class Writer:
 
 def _write(descriptor: int, data: bytes | memoryview) -> int:
     rest = memoryview(data)
-    while rest:  # a disk that fills up takes a part, then raises
+    while rest:  # a full disk takes a part of the data, then raises
         rest = rest[os.write(descriptor, rest) :]
     return len(data)

@@ -1,9 +1,9 @@
-"""Which windows a batch is made of, and the batch made of them; one rule for dataset and replay.
+"""The sequences of a batch, drawn by one rule for datasets and replay buffers.
 
-A window is `length` images in a row, and each window of each trajectory is equally likely. A
-trajectory with fewer images counts as one window: it is taken whole and chained, the window goes on
-with further trajectories from their first image, drawn uniformly, with `is_first` True at each
-joint. So no trajectory vanishes because it is short.
+A window is `length` consecutive images of a trajectory, and all windows of all trajectories are
+equally likely. A trajectory with fewer images counts as one window: it is taken whole, and the
+sequence continues with further trajectories from their first image, drawn uniformly, with
+`is_first` True at each joint. So no trajectory is lost because it is short.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,7 +19,7 @@ Row = list[Piece]  # the pieces that make one sequence
 
 
 class Windows:
-    """Draws windows from trajectories of known lengths.
+    """Draws sequences from trajectories of known lengths.
 
     :param lengths: (N,) int, the number of actions of each trajectory (it has one image more)
     """
@@ -31,7 +31,7 @@ class Windows:
         # that threads drawing windows of different lengths do not mix them
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
-        """The pieces of `batch_size` windows: of one, or of several if trajectories are short."""
+        """Draw the pieces of `batch_size` sequences; several each if trajectories are short."""
         known, ends = self._ends
         if known != length:
             ends = np.cumsum(np.maximum(self._images - length + 1, 1))
@@ -61,7 +61,7 @@ def make_batch(
     width: int,
     each: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
 ) -> Batch:
-    """Copies the pieces of each row, one after the other, into a fresh Batch.
+    """Copy the pieces of each row, one after the other, into a new Batch.
 
     :param read: where a piece is: a trajectory, or a part of one, and the images to take of it
     :param image_shape: (H, W, 3)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: arrays and JSON in one checked file, no pickle.
+"""Atomic files: arrays and JSON in one file with checksums, without pickle.
 
 Such a file is a zip without compression; each member carries a checksum that reading verifies.
 """
@@ -18,7 +18,7 @@ VERSION = 1
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; it takes the place of `path` if the block ends well.
+    """Yield a temporary path beside `path`, which replaces `path` if the block succeeds.
 
     The file is on the disk (fsync) before it is renamed, so a crash at any moment leaves one of the
     two whole. A block that raises leaves `path` as it was and nothing beside it.
@@ -39,7 +39,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes the names in `folder` durable, where the system can (not on Windows)."""
+    """Force the names in `folder` to the disk, where the system can (not on Windows)."""
     if hasattr(os, "O_DIRECTORY"):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -54,7 +54,7 @@ def save_arrays(
     about: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
-    """Writes `about` (JSON) and `arrays` to one file of this `kind`, whole or not at all."""
+    """Write `about` (JSON) and `arrays` atomically to one file of this `kind`."""
     head = {"kind": kind, "version": VERSION, **about}
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         archive.writestr("about.json", json.dumps(head))
@@ -68,7 +68,7 @@ def save_arrays(
 def load_arrays(
     path: str | os.PathLike[str], kind: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Reads what `save_arrays` wrote, every byte checked.
+    """Read a file of `save_arrays` and verify every byte.
 
     :raises ValueError: a file that is cut short, damaged, of another kind or of a newer version
     """

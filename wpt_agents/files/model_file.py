@@ -1,4 +1,4 @@
-"""The model file: one zip of JSON and safetensors, written whole or not at all, and no pickle."""
+"""The model file: one zip of JSON and safetensors, written atomically, without pickle."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def write_model(
     about: Mapping[str, Any],
     tensors: Mapping[str, Mapping[str, Tensor]],
 ) -> None:
-    """Writes JSON and named groups of tensors to `path`, or to an open binary file."""
+    """Write JSON and named groups of tensors to `path`, or to an open binary file."""
     if isinstance(path, str | os.PathLike):
         with replacing(path) as temporary, open(temporary, "wb") as file:
             _write(file, about, tensors)
@@ -48,7 +48,7 @@ def _write(
 def read_model(
     path: str | os.PathLike[str] | BufferedIOBase,
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
-    """Reads what `write_model` wrote, every byte checked.
+    """Read a file of `write_model` and verify every byte.
 
     :raises FileNotFoundError: no such file
     :raises ValueError: a file that is cut short, damaged, not ours, or of a newer version
@@ -56,7 +56,7 @@ def read_model(
     if not isinstance(path, str | os.PathLike):
         return _read(path, "The file")
     if not Path(path).exists():
-        raise FileNotFoundError(f"There is no model file {path}; pass the path given to save()")
+        raise FileNotFoundError(f"There is no model file {path}; pass the path that save() wrote")
     with open(path, "rb") as file:
         return _read(file, str(path))
 
@@ -86,7 +86,7 @@ def _tensors(archive: zipfile.ZipFile, group: str) -> dict[str, Tensor]:
 
 
 def _members(archive: zipfile.ZipFile) -> list[str]:
-    """The groups of tensors; nothing else may be there, neither pickled nor compressed."""
+    """The names of the groups of tensors; any other member is refused."""
     names = archive.namelist()
     if ABOUT not in names:
         raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
@@ -98,13 +98,13 @@ def _members(archive: zipfile.ZipFile) -> list[str]:
 
 
 def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
-    """The running averages of an optimiser, by parameter number and name."""
+    """The running averages of an optimiser, named by parameter number and kind."""
     state = optimizer.state_dict()["state"]
     return {f"{i}.{key}": value for i, group in state.items() for key, value in group.items()}
 
 
 def load_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Puts what `optimizer_tensors` gave back; learning rates stay as they are."""
+    """Restore the tensors of `optimizer_tensors`; learning rates do not change."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         index, key = name.split(".")

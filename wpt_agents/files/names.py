@@ -1,11 +1,11 @@
-"""Words for people: errors for names that do not exist, and nouns with their number."""
+"""Text for messages: errors for unknown names, and nouns with their number."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def unknown_name(kind: str, name: object, valid: Iterable[str]) -> ValueError:
-    """The error to raise for an unknown name: what came, and what would do."""
+    """The error for an unknown name, with similar names and all valid ones."""
     names = sorted(valid)
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""

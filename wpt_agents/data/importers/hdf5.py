@@ -57,8 +57,8 @@ class Hdf5Episodes(TableEpisodes):
         attributes = self._handle["data"].attrs if "data" in self._handle else {}
         for attribute, key in (("problem_info", "language_instruction"), ("env_args", "env_name")):
             try:
-                told = json.loads(attributes[attribute])[key]
+                label = json.loads(attributes[attribute])[key]
             except (KeyError, TypeError, ValueError):
                 continue
-            return "".join(told) if isinstance(told, list) else str(told)
+            return "".join(label) if isinstance(label, list) else str(label)
         return None

@@ -152,7 +152,7 @@ def _is_picture(data: bytes) -> bool:
 
 
 def _instruction(steps: dict[str, Any]) -> str | None:
-    """What the episode's first step was told to do, in words."""
+    """The language instruction of the episode's first step, if there is one."""
     for name in INSTRUCTIONS:
         values = steps.get(name)
         if isinstance(values, list) and values and values[0]:

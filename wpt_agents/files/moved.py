@@ -21,7 +21,7 @@ FOLDERS = {  # of version 0.2, and the modules of version 0.1 that are in them u
     "fast": ("acting", "compiled", "scan"),
     "files": ("archive", "model_file", "names"),
     "model": (
-        *("actor_critic", "behavior_cloning", "distributions", "networks", "policy", "rssm"),
+        *("actor_critic", "behavior_cloning", "distributions", "policy", "rssm"),
         "world_model",
     ),
     "training": ("checks", "distributed", "guidance", "pretraining", "rollout"),
@@ -44,6 +44,21 @@ MOVED |= {
 }
 
 
+# Modules of which more than one has come; names are looked up in all of them.
+SPLIT = {
+    "wpt_agents.networks": tuple(f"wpt_agents.model.{n}" for n in ("images", "layers", "sizes")),
+    "wpt_agents.policy": tuple(
+        f"wpt_agents.model.{n}" for n in ("policy", "prior_policy", "observations")
+    ),
+}
+MOVED["wpt_agents.networks"] = "wpt_agents.model.images"
+
+
+def new_modules(old: str) -> list[ModuleType]:
+    """Return the modules that hold the names of an old one."""
+    return [import_module(name) for name in SPLIT.get(old, (MOVED[old],))]
+
+
 class MovedModule(ModuleType):
     """Stands at an old path; its names are those of the module at the new path."""
 
@@ -51,11 +66,14 @@ class MovedModule(ModuleType):
         """Return a name of the module at the new path."""
         if name.startswith("__"):  # the import system asks for some
             raise AttributeError(name)
-        return getattr(import_module(MOVED[self.__name__]), name)
+        for module in new_modules(self.__name__):
+            if hasattr(module, name):
+                return getattr(module, name)
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
 
     def __dir__(self) -> list[str]:
         """Return the names of the module at the new path."""
-        return dir(import_module(MOVED[self.__name__]))
+        return [name for module in new_modules(self.__name__) for name in dir(module)]
 
 
 class MovedFinder(MetaPathFinder, Loader):

@@ -56,6 +56,8 @@ def pixels(
 def _looked_at(
     env: gym.Env, rendering: str | None, camera: "Camera | None", image_key: str | None
 ) -> gym.Env:
+    if not isinstance(env, gym.Env):
+        raise ValueError(f"pixels wraps one Gymnasium environment, not {_instead(env)}")
     if rendering is None and camera is not None:
         raise ValueError(f"camera={camera!r} needs our renderer: add rendering='near', for example")
     if image_key is not None:
@@ -63,6 +65,23 @@ def _looked_at(
             raise ValueError("image_key and rendering are two ways to see: give one of them")
         return _LookObserved(env, image_key)
     return _LookRendered(env) if rendering is None else _LookDrawn(env, rendering, camera)
+
+
+def _instead(env: Any) -> str:
+    """What came in place of an environment, and what to write."""
+    if isinstance(env, str):
+        return f"an id: `env = wpt_envs.pixels(gymnasium.make({env!r}, render_mode='rgb_array'))`"
+    if hasattr(env, "num_envs"):
+        return (
+            f"the vector {type(env).__name__}: wrap each environment in it, for example by "
+            "gymnasium.make_vec(..., render_mode='rgb_array', wrappers=[wpt_envs.pixels])"
+        )
+    if hasattr(env, "action_spec") and hasattr(env, "physics"):
+        return (
+            "a dm_env: "
+            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array'))`"
+        )
+    return f"a {type(env).__name__}"
 
 
 class _LookRendered(gym.Wrapper):

@@ -30,8 +30,8 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
             raise ValueError(f"The action contains NaN or infinity: {action}")
         if np.any(action < box.low - 1e-6) or np.any(action > box.high + 1e-6):
             raise ValueError(
-                f"The action {action} lies outside [{box.low.min()}, {box.high.max()}]; "
-                "clip it with numpy.clip"
+                f"The action {action} lies outside [{box.low.min()}, {box.high.max()}]: "
+                "`action = numpy.clip(action, env.action_space.low, env.action_space.high)`"
             )
         return action
 

@@ -1,9 +1,13 @@
 """What an environment returns as its picture: converted once, or refused with the culprit named."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
+import shimmy
 import wpt_envs
+from dm_control import suite
 from gymnasium import spaces
 from wpt_envs.pictures import PictureReader, shrink
 
@@ -128,3 +132,40 @@ def test_an_entry_that_is_not_there_or_no_picture_is_refused_by_name():
         wpt_envs.pixels(Cameras(), image_key="top", rendering="near")
     with pytest.raises(ValueError, match="camera='top' needs our renderer"):
         wpt_envs.pixels(Cameras(), camera="top")
+
+
+# ---------------------------------------------------------------- what is no single environment
+
+
+def line(function, words):
+    """The line of code in a refusal that matches `words`."""
+    with pytest.raises(ValueError, match=words) as refusal:
+        function()
+    return re.search("`(.*)`", str(refusal.value)).group(1)
+
+
+def test_pixels_of_what_is_no_environment_says_what_to_write():
+    names = {"gymnasium": gym, "wpt_envs": wpt_envs, "shimmy": shimmy}
+    exec(line(lambda: wpt_envs.pixels("Reacher-v5"), "not an id"), names)
+    assert names["env"].reset(seed=0)[0].std() > 3
+    names["env"] = suite.load("cartpole", "balance")
+    exec(line(lambda: wpt_envs.pixels(names["env"]), "not a dm_env"), names)
+    assert names["env"].reset(seed=0)[0].std() > 3
+    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="sync")
+    with pytest.raises(ValueError, match=r"not the vector SyncVectorEnv: .*wrappers=\[wpt_envs"):
+        wpt_envs.pixels(vector)
+    vector = gym.make_vec(
+        "Reacher-v5", 2, "sync", render_mode="rgb_array", wrappers=[wpt_envs.pixels]
+    )
+    assert vector.reset(seed=0)[0].shape == (2, 64, 64, 3)
+    with pytest.raises(ValueError, match="not a function"):
+        wpt_envs.pixels(line)
+
+
+def test_an_action_out_of_bounds_is_taken_once_it_is_clipped_as_the_refusal_says():
+    env = wpt_envs.pixels(Cameras(), image_key="top")
+    env.reset()
+    names = {"numpy": np, "env": env, "action": np.array([0.5, 1.5])}
+    exec(line(lambda: env.step(names["action"]), "outside"), names)
+    assert names["action"].tolist() == [0.5, 1.0]
+    env.step(names["action"])

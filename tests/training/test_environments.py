@@ -261,6 +261,19 @@ def test_prediction_and_evaluation_take_the_dictionary_too():
     assert mean == 28
 
 
+@pytest.mark.filterwarnings("ignore:Evaluation environment")
+def test_the_chosen_image_is_seen_in_learning_predicting_and_after_loading(tmp_path):
+    model = agent(Cameras("top", "wrist"), image_key="top", learning_starts=0).learn(42)
+    assert all_on_time(model, 6)
+    obs, other = Cameras("top", "wrist").reset()[0], noise()
+    model.save(tmp_path / "model")
+    loaded = WPT.load(tmp_path / "model", device="cpu")
+    for each in (model, loaded):
+        seen, _ = each.predict({**obs, "wrist": other}, deterministic=True)
+        assert np.array_equal(seen, each.predict(obs["top"], deterministic=True)[0])
+    assert evaluate_policy(model, Monitor(Cameras("top", "wrist")), 1)[0] == 28
+
+
 def test_of_several_images_one_is_to_be_chosen():
     with pytest.raises(ValueError, match=r"2 images, 'top', 'wrist': choose .*image_key='top'"):
         agent(Cameras("top", "wrist"))

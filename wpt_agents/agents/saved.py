@@ -102,6 +102,7 @@ class SavedAgent(KeywordAgent):
     def _setup_model(self) -> None:
         self.set_random_seed(self.hyperparameters.seed)
         self.policy = self.make_policy().to(self.device)
+        self.policy.image_key = self.hyperparameters.image_key
         self.learner = self.make_learner()
 
     @abstractmethod
@@ -150,7 +151,7 @@ class SavedAgent(KeywordAgent):
         return as_vec_env(env, monitor=monitor_wrapper)
 
     def _checked(self, env: GymEnv | str) -> VecEnv:
-        wrapped = self._wrap_env(env, self.verbose)
+        wrapped = as_vec_env(env, self.hyperparameters.image_key)
         self.check_env(wrapped)
         return wrapped
 
@@ -172,6 +173,7 @@ class SavedAgent(KeywordAgent):
         self.observation_space = env.observation_space
         self.action_space = env.action_space
         self.policy.observation_space = env.observation_space
+        self.policy.image_key = self.hyperparameters.image_key
         self.policy.set_action_space(env.action_space)
         if other:
             self.on_other_actions()

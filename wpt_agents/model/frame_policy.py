@@ -27,6 +27,7 @@ class FramePolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    image_key: str | None = None  # the entry to see of Dict observations; their only image if None
     action_mask: Tensor  # (A,) bool, all True: nothing is padded
 
     def __init__(
@@ -128,7 +129,7 @@ class FramePolicy(BasePolicy):
         :param state: what the last call returned; None at the start
         :param episode_start: (n,) bool, where an episode begins; None for nowhere
         """
-        images, batched = to_images(observation)
+        images, batched = to_images(observation, self.image_key)
         action, state = self.act(images, state, episode_start, deterministic)
         action = self.to_env(action)
         return (action if batched else action[0]), state

@@ -51,6 +51,7 @@ class WPTPolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    image_key: str | None = None  # the entry to see of Dict observations; their only image if None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
@@ -172,7 +173,7 @@ class WPTPolicy(BasePolicy):
         :param state: what the last call returned; None at the start
         :param episode_start: (n,) bool, where an episode begins; None for nowhere
         """
-        images, batched = to_images(observation)
+        images, batched = to_images(observation, self.image_key)
         action, state = self.act(images, state, episode_start, deterministic)
         action = self.to_env(action)
         return (action if batched else action[0]), state

@@ -13,6 +13,7 @@ from wpt_agents.model.observations import Observation, State, stack_frames, to_i
 class HasClone(Protocol):
     """A policy with a prior actor."""
 
+    image_key: str | None  # the entry to see of Dict observations
     prior_actor: PriorActor
     action_mask: Tensor  # (A,) bool, True at the entries of an action that the robot has
 
@@ -38,7 +39,7 @@ class PriorPolicy:
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
         """Act as `WPTPolicy.predict`; the clone is deterministic in any case."""
-        images, batched = to_images(observation)
+        images, batched = to_images(observation, self.policy.image_key)
         frames = stack_frames(images, state[0] if state else None, episode_start)
         action = self.policy.to_env(prior_action(self.policy, frames))
         return (action if batched else action[0]), (frames,)

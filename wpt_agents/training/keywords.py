@@ -143,6 +143,12 @@ class Keywords:
         "name of the robot, which is written on the episodes that are collected",
         Stage.ACTING,
     )
+    image_key: str | None = keyword(
+        None,
+        must("a name", lambda value: isinstance(value, str)),
+        "entry of Dict observations that is the image to see; their only image if None",
+        Stage.ACTING,
+    )
     learning_starts: int = count(
         1_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )

@@ -17,7 +17,7 @@ CHANNELS = {1: "grayscale", 3: "colour", 4: "RGBA"}
 
 
 def channel_axis(shape: tuple[int, ...]) -> int | None:
-    """The axis of an image that holds its 1, 3 or 4 channels: 2, 0, or None if it is no image.
+    """Return the axis of an image's 1, 3 or 4 channels, 2 or 0, or None if it is no image.
 
     :param shape: of one image; colour is looked for before grayscale and RGBA
     """
@@ -28,7 +28,7 @@ def channel_axis(shape: tuple[int, ...]) -> int | None:
 
 
 def image_keys(shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> list[str]:
-    """The entries of a dictionary that are images: those in colour, or else the others.
+    """Return the entries of a dictionary that are images: those in colour, or else the others.
 
     :param shapes: for each entry the shape of one observation, and its dtype
     """
@@ -42,7 +42,7 @@ def image_keys(shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> list[str]:
 
 
 def to_images(observation: Observation, image_key: str | None = None) -> tuple[np.ndarray, bool]:
-    """Observations as (n, 64, 64, 3) uint8, and whether there was a batch axis.
+    """Convert observations to (n, 64, 64, 3) uint8, and return whether there was a batch axis.
 
     Takes (H, W, C) and (C, H, W), one or a batch. A single channel is repeated, a fourth (the
     transparency) is left out, and other sizes are resized.
@@ -85,14 +85,14 @@ def _key_of(observation: Mapping[str, Any], image_key: str | None) -> str:
 
 
 def _range(observation: np.ndarray) -> str:
-    """The range of values, for a message; empty where there is none."""
+    """Return the range of values for a message, or nothing if they are no numbers."""
     if observation.size == 0 or not np.issubdtype(observation.dtype, np.number):
         return ""
     return f" with values from {observation.min():.4g} to {observation.max():.4g}"
 
 
 def check_episode_start(episode_start: Any, n: int) -> np.ndarray:
-    """One bool for each of n environments, False everywhere if there is None.
+    """Return one bool for each of n environments, all False for None.
 
     :raises ValueError: another number of them
     """
@@ -108,7 +108,7 @@ def check_episode_start(episode_start: Any, n: int) -> np.ndarray:
 
 
 def check_state(state: Any, shapes: tuple[tuple[int, ...], ...], n: int) -> None:
-    """Refuses a recurrent state that is not of this model.
+    """Refuse a recurrent state of another model.
 
     :param shapes: of its arrays, without the axis of the environments
     :raises ValueError: another kind of state, or one of another number of environments

@@ -37,7 +37,7 @@ ACCEPTED = (
 
 
 def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> VecEnv:
-    """Any environment as a VecEnv whose observations belong to nobody else.
+    """Make a VecEnv of any environment; its observations are copies that nobody else writes to.
 
     :param env: an id, a Gymnasium environment, a function that makes one, a list of these, a
         `gymnasium.vector` environment or a VecEnv
@@ -67,7 +67,7 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
 
 
 def make(env: Any) -> gym.Env:
-    """One Gymnasium environment from an id, a spec, a function or a class that makes it, or itself.
+    """Make one Gymnasium environment from an id, a spec, or a function or class that makes it.
 
     :raises ValueError: anything else, with what to write instead
     """
@@ -141,7 +141,7 @@ class OwnObservation(gym.ObservationWrapper):
     """Copies each observation, as some environments draw the next one into the same array."""
 
     def observation(self, observation: Any) -> Any:
-        """The same values in arrays of their own."""
+        """Return a copy."""
         return observation.copy() if isinstance(observation, np.ndarray) else deepcopy(observation)
 
 
@@ -150,7 +150,7 @@ def _owning(env: gym.Env) -> gym.Env:
 
 
 def _own_observations(env: VecEnv) -> None:
-    """Makes the environments of a DummyVecEnv copy: it resets before it reports the last image."""
+    """Let the environments of a DummyVecEnv copy, as it resets before it reports the last image."""
     inner = _innermost(env)
     if isinstance(inner, DummyVecEnv):
         inner.envs = [_owning(each) for each in inner.envs]
@@ -163,7 +163,7 @@ def _innermost(env: VecEnv | None) -> VecEnv | None:
 
 
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
-    """The entry to see, None if there is none; warns of what is left out."""
+    """Return the entry to see, or None if there is none; warn of what is left out."""
     boxes = {key: box for key, box in space.spaces.items() if isinstance(box, spaces.Box)}
     images = image_keys({key: (box.shape, box.dtype) for key, box in boxes.items()})
     if image_key is not None:
@@ -193,13 +193,13 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
 def last_observation(
     env: VecEnv | None, infos: Sequence[Mapping[str, Any]], i: int, first: np.ndarray
 ) -> np.ndarray:
-    """What environment i showed last, before the VecEnv reset it.
+    """Return the last observation of environment i, from before the VecEnv reset it.
 
     Stable-Baselines3 names it `terminal_observation`, Gymnasium `final_obs`, before 1.0
     `final_observation`.
 
-    :param first: what it shows since; a warning is given if that is the same
-    :raises ValueError: it is not there
+    :param first: the first observation after the reset; if both are equal, a warning says so
+    :raises ValueError: the info lacks it
     """
     names = ("terminal_observation", "final_obs", "final_observation")
     last = next((infos[i][name] for name in names if infos[i].get(name) is not None), None)

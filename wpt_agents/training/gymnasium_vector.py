@@ -34,7 +34,7 @@ class GymnasiumVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """The first observations; seeds given to `seed` count once."""
+        """Return the first observations; the seeds of `seed` apply to one reset."""
         seeds = [None if seed is None else int(seed) for seed in self._seeds]
         obs, infos = self.vector.reset(seed=None if None in seeds else seeds)  # type: ignore
         self.reset_infos = [_of_one(infos, i) for i in range(self.num_envs)]
@@ -43,13 +43,13 @@ class GymnasiumVecEnv(VecEnv):
         return deepcopy(obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Begins a step: in worker processes where there are some, else it waits."""
+        """Begin a step in worker processes; without them it is taken in `step_wait`."""
         if isinstance(self.vector, AsyncVectorEnv):
             self.vector.step_async(actions)
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Ends the step, and begins new episodes where some ended."""
+        """End the step, and begin new episodes where some ended."""
         if isinstance(self.vector, AsyncVectorEnv):
             obs, rewards, terminated, truncated, vector_infos = self.vector.step_wait()
         else:
@@ -72,16 +72,16 @@ class GymnasiumVecEnv(VecEnv):
         return obs, rewards, dones, infos
 
     def close(self) -> None:
-        """Closes the environments."""
+        """Close the environments."""
         self.vector.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """What each environment renders."""
+        """Return what each environment renders."""
         images: Any = self.vector.render()
         return [None] * self.num_envs if images is None else list(images)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each environment, or else of the vector itself."""
+        """Return an attribute of each environment, or of the vector if it has no environments."""
         inner = self.vector.unwrapped
         if isinstance(inner, SyncVectorEnv | AsyncVectorEnv):
             values: Sequence[Any] = inner.get_attr(attr_name)
@@ -90,19 +90,19 @@ class GymnasiumVecEnv(VecEnv):
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Sets an attribute of all environments, as Gymnasium can."""
+        """Set an attribute of all environments; Gymnasium cannot do so for some."""
         self._all_of(indices, "set_attr")
         self.vector.unwrapped.set_attr(attr_name, value)  # type: ignore[attr-defined]
 
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Calls a method of all environments, as Gymnasium can."""
+        """Call a method of all environments; Gymnasium cannot do so for some."""
         self._all_of(indices, "env_method")
         return list(self.vector.unwrapped.call(method_name, *args, **kwargs))  # type: ignore
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Whether each environment has this wrapper; False of those in other processes."""
+        """Return whether each environment has this wrapper; False for those in other processes."""
         envs = getattr(self.vector.unwrapped, "envs", None)
         chosen = list(self._get_indices(indices))
         if not envs or not issubclass(wrapper_class, gym.Wrapper):
@@ -115,7 +115,7 @@ class GymnasiumVecEnv(VecEnv):
 
 
 def _autoreset_mode(vector: VectorEnv) -> AutoresetMode:
-    """The mode of a vector; refuses those whose first observations come too late for a VecEnv."""
+    """Return the mode of a vector; refuse those whose first observations come too late."""
     inner, mode = vector.unwrapped, vector.metadata.get("autoreset_mode")
     name = type(inner).__name__
     if mode is None:
@@ -132,14 +132,14 @@ def _autoreset_mode(vector: VectorEnv) -> AutoresetMode:
 
 
 def _at(observations: Any, i: int) -> Any:
-    """One environment's part of a batch of observations."""
+    """Return one environment's part of a batch of observations."""
     if isinstance(observations, Mapping):
         return {key: _at(value, i) for key, value in observations.items()}
     return deepcopy(observations[i])
 
 
 def _of_one(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """One environment's info from Gymnasium's arrays, in which `_key` says who has the `key`."""
+    """Return one environment's info; in Gymnasium's arrays `_key` says who has the `key`."""
     one = {}
     for key, values in infos.items():
         is_mask = key.startswith("_") and key[1:] in infos

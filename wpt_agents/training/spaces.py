@@ -58,7 +58,7 @@ def check_observations(env: VecEnv) -> None:
 
 
 def is_image(space: spaces.Space, channels: int | None = None) -> bool:
-    """Whether a space is of uint8 images, of this number of channels if there is one."""
+    """Return whether a space is of uint8 images, with this number of channels unless it is None."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
     axis = channel_axis(space.shape)
@@ -66,7 +66,7 @@ def is_image(space: spaces.Space, channels: int | None = None) -> bool:
 
 
 def _layers(env: VecEnv) -> Iterator[Any]:
-    """The environment and what it wraps, from the outside to the inside, as far as it is here."""
+    """Yield the environment and what it wraps in this process, from the outside to the inside."""
     layer: Any = env
     while True:
         yield layer
@@ -81,7 +81,7 @@ def _layers(env: VecEnv) -> Iterator[Any]:
 
 
 def _culprit(env: VecEnv, channels: int | None = None) -> str | None:
-    """The wrapper that turns images into something else, and the advice to leave it out."""
+    """Return the advice to leave out the wrapper that spoils the images, or None if none does."""
     layers = list(_layers(env))
     for outer, inner in pairwise(layers):
         if is_image(inner.observation_space, channels) and outer.observation_space != (
@@ -100,7 +100,7 @@ def _culprit(env: VecEnv, channels: int | None = None) -> str | None:
 
 
 def observation_remedy(space: spaces.Space) -> str:
-    """What turns observations of this space into images, to the letter."""
+    """Return the line of code that turns observations of this space into images."""
     if isinstance(space, spaces.Dict):
         keys = ", ".join(map(repr, space.spaces))
         return f"no entry of {keys} is a uint8 image; {RENDER}"
@@ -129,7 +129,7 @@ def observation_remedy(space: spaces.Space) -> str:
 
 
 def _pixel_values(space: spaces.Box) -> str:
-    """How values of this dtype and these bounds become bytes."""
+    """Return the line of code that turns values of this dtype and these bounds into bytes."""
     low, high = float(space.low.min()), float(space.high.max())
     if (low, high) == (0, 255):
         formula, what = "image.round().astype('uint8')", f"bytes stored as {space.dtype}"
@@ -175,7 +175,7 @@ def check_actions(space: spaces.Space, max_action_dim: int | None) -> None:
 
 
 def action_remedy(space: spaces.Space) -> str:
-    """What turns actions of this space into a flat Box, to the letter."""
+    """Return the line of code that turns actions of this space into a flat Box."""
     if isinstance(space, spaces.Box):
         formula = f"action.reshape({space.shape})"
         bounds = "gymnasium.spaces.Box(env.action_space.low.ravel(), env.action_space.high.ravel()"

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from wpt_agents.zoo.plan.methods import defaults
+from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.plan.runs import Run
 
 
@@ -33,7 +34,8 @@ def check_folder(job: Run, force: bool) -> None:
         raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
         section = job.algorithm.section
-        usual = {f"{section}.{k}": v for k, v in defaults(job.algorithm.agent).items()}
+        keywords = {section: dict(defaults(job.algorithm.agent))}
+        usual = _flat(Preset().as_dict() | keywords)  # of keys that older versions do not know
         before = usual | _flat(yaml.safe_load(path.read_text()))
         now = usual | _flat(json.loads(json.dumps(job.config())))
         differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))

@@ -379,7 +379,7 @@ def test_the_replay_value_loss_teaches_the_critic_alone(scale):
     same = all(map(torch.equal, without.critic.parameters(), policy.critic.parameters()))
     assert same is (scale == 0)
     for part in ("world_model", "actor"):
-        weights = (getattr(each, part).parameters() for each in (without, policy))
+        weights = (getattr(item, part).parameters() for item in (without, policy))
         assert all(map(torch.equal, *weights))
 
 
@@ -396,8 +396,8 @@ def test_the_replay_value_loss_is_that_of_the_replayed_rewards():
     for t in (2, 1, 0):
         later = batch.reward[:, t] + 0.5 * returns[:, t + 1]
         returns[:, t] = torch.where(batch.is_first[:, t + 1], value[:, t], later)
-    each = two_hot_loss(policy.critic(post.feat), returns)
-    expected = (each * batch.reward_known).sum() / batch.reward_known.sum()
+    losses = two_hot_loss(policy.critic(post.feat), returns)
+    expected = (losses * batch.reward_known).sum() / batch.reward_known.sum()
     torch.testing.assert_close(loss, expected)
 
 

@@ -828,7 +828,7 @@ def test_the_command_warns_of_lossy_images_and_takes_limits(tmp_path, monkeypatc
     [
         (["lerobt"], "Did you mean 'lerobot'"),
         (["npz", "--camera", "front"], "No option for npz 'camera'"),
-        (["hdf5", "--low=a,b"], "--low wants numbers with commas between, got 'a,b'"),
+        (["hdf5", "--low=a,b"], "--low takes numbers separated by commas, got 'a,b'"),
         (["npz"], "holds no .npz file"),
     ],
 )

@@ -16,7 +16,8 @@ def encode(w, image, strides, centre):
     """The convolutions over stacked frames: w of a FrameEncoder."""
     x = torch.cat([image[:, f].permute(0, 3, 1, 2) for f in range(3)], 1) / 255 - centre
     for i, stride in enumerate(strides):
-        x = F.conv2d(x, w[f"layers.{i}.weight"], w[f"layers.{i}.bias"], stride=stride).clamp_min(0)
+        x = F.conv2d(x, w[f"layers.{i}.weight"], w[f"layers.{i}.bias"], stride=stride)
+        x = x * (x > 0)  # clamp_min would let a gradient through at exactly 0, which units reach
     return x.reshape(len(x), -1)
 
 
@@ -30,7 +31,8 @@ def trunk(w, embed):
 def two_layers(w, name, x):
     """An MLP of two hidden layers: w of `mlp` under `name`."""
     for i in (0, 2):
-        x = (x @ w[f"{name}.{i}.weight"].T + w[f"{name}.{i}.bias"]).clamp_min(0)
+        x = x @ w[f"{name}.{i}.weight"].T + w[f"{name}.{i}.bias"]
+        x = x * (x > 0)
     return x @ w[f"{name}.4.weight"].T + w[f"{name}.4.bias"]
 
 

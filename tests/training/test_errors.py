@@ -93,7 +93,7 @@ def test_a_dataset_that_is_not_there_is_named(tmp_path):
 def test_an_empty_dataset_is_refused(tmp_path):
     TrajectoryDataset.create(tmp_path / "data")
     refused(tmp_path / "data", r"data is empty: append trajectories")
-    refused([], "is empty: append trajectories")
+    refused([], "is an empty list")
 
 
 def test_a_dataset_too_short_for_a_window_is_refused():
@@ -116,7 +116,7 @@ def test_a_dataset_of_more_actions_is_refused():
 
 
 def test_a_refused_dataset_leaves_the_run_folder_alone(tmp_path):
-    refused([], "is empty", run_dir=tmp_path)
+    refused([], "is an empty list", run_dir=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

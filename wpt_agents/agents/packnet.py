@@ -225,7 +225,8 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self.policy.prune(self.progress.task, tasks_left)
         self.policy.freeze_rest()
         self._retrain(progress_bar)
-        with torch.random.fork_rng():
+        drawn_on = [self.device] if self.device.type == "cuda" else []
+        with torch.random.fork_rng(devices=drawn_on):
             torch.manual_seed(self.streams.integer(Purpose.REDRAW, self.progress.task))
             self.policy.redraw()
         self.replay_buffer = ReplayBuffer()

@@ -136,11 +136,11 @@ def declare(
         attribute.__set_name__(agent, name)
         setattr(agent, name, attribute)
     agent.__signature__ = signature(keywords, init)  # type: ignore[attr-defined]
-    own = agent.__dict__.get("__doc__")
-    if own:
+    text = agent.__dict__.get("__doc__")
+    if text:
         indented = textwrap.indent(keywords.documentation(), "    ")
-        gap = "\n" if ":param" in own else "\n\n"  # a list of parameters stands apart
-        agent.__doc__ = f"{own.rstrip()}{gap}{indented}\n    "
+        gap = "\n" if ":param" in text else "\n\n"  # a list of parameters stands apart
+        agent.__doc__ = f"{text.rstrip()}{gap}{indented}\n    "
 
 
 def signature(keywords: type[Keywords], init: Callable[..., None]) -> inspect.Signature:

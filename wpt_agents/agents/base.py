@@ -77,7 +77,7 @@ class PixelAgent(SavedAgent):
         rng = self.streams.numpy(Purpose.WARMUP, self.num_timesteps)
         width = self.policy.action_mask.shape[0]
         actions = rng.uniform(-1, 1, (len(frames), width)) * self.policy.action_mask.cpu().numpy()
-        return actions.astype(np.float32)
+        return np.asarray(actions, np.float32)
 
     def on_episode(self, trajectory: Trajectory) -> None:
         """Look at a finished episode before it is added to the replay buffer."""
@@ -173,7 +173,7 @@ class PixelAgent(SavedAgent):
         frame = to_images(self._last_obs)[0][0]
         if self.rollout is not None and not self._last_episode_starts.all():
             frame = next(iter(self.rollout.images[0]), frame)
-        return frame[None]
+        return np.asarray(frame)[None]
 
     def _open_rollout(self) -> Rollout:
         """Return the open episodes; new ones if all environments were just reset."""

@@ -20,16 +20,20 @@ from torch import Generator, Tensor, nn
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Batch, Trajectory
-from wpt_agents.model.images import Encoder
-from wpt_agents.model.layers import Linear, LinearNorm, frozen
+from wpt_agents.model.curiosity import ICM as ICM
+from wpt_agents.model.curiosity import MEMBERS as MEMBERS
+from wpt_agents.model.curiosity import Ensemble as Ensemble
+from wpt_agents.model.curiosity import Scale as Scale
+from wpt_agents.model.curiosity import disagreement as disagreement
+from wpt_agents.model.curiosity import ensemble_loss as ensemble_loss
+from wpt_agents.model.curiosity import forward_error as forward_error
+from wpt_agents.model.curiosity import icm_loss as icm_loss
+from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent
-from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner, Metrics
 from wpt_agents.training.randomness import Purpose
-
-MEMBERS = 5  # of the ensemble, as in Plan2Explore
 
 # Keywords of WPT for exploring: nothing to retrieve, nobody to guide, two random episodes first.
 EXPLORE: Mapping[str, Any] = {
@@ -45,128 +49,6 @@ EXPLORE: Mapping[str, Any] = {
     "gamma": 0.95,
     "target_fraction": 0.1,
 }
-
-
-class Scale(nn.Module):
-    """Divides by a running mean, so that a reward is about 1 however surprise shrinks."""
-
-    mean: Tensor
-    weight: Tensor
-
-    def __init__(self, keep: float = 0.99) -> None:
-        super().__init__()
-        self.keep = keep
-        self.register_buffer("mean", torch.zeros(()))
-        self.register_buffer("weight", torch.zeros(()))
-
-    def see(self, surprise: Tensor) -> None:
-        """Takes one batch into the mean; the first counts in full."""
-        self.mean.mul_(self.keep).add_((1 - self.keep) * surprise.detach().mean())
-        self.weight.mul_(self.keep).add_(1 - self.keep)
-
-    def forward(self, surprise: Tensor) -> Tensor:
-        """(...) -> (...)."""
-        return surprise * (self.weight / self.mean.clamp_min(1e-8))
-
-
-class ICM(nn.Module):
-    """Features that tell which action was taken, and how badly the next ones were foreseen.
-
-    :param size: the widths
-    :param action_dim: the padded action width, A
-    :param forward_share: β of Pathak et al., the forward model's share of the loss
-    """
-
-    def __init__(self, size: Size, action_dim: int, forward_share: float = 0.2) -> None:
-        super().__init__()
-        self.forward_share, features, units = forward_share, size.units, size.units
-        self.encoder = Encoder(size.depth)
-        self.project = Linear(self.encoder.embed_dim, features)
-        self.inverse = nn.Sequential(LinearNorm(2 * features, units), Linear(units, action_dim))
-        self.dynamics = nn.Sequential(
-            LinearNorm(features + action_dim, units), Linear(units, features)
-        )
-        self.scale = Scale()
-
-    def features(self, image: Tensor) -> Tensor:
-        """φ(o): (..., 64, 64, 3) uint8 -> (..., F)."""
-        return self.project(self.encoder(image))
-
-    def forward(self, image: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The two models on sequences.
-
-        :param image: (B, T, 64, 64, 3) uint8
-        :param action: (B, T, A), what led to each image
-        :return: the actions that the inverse model reads from pairs of images (B, T - 1, A), and
-            the surprise of each next image, the forward model's error (B, T - 1)
-        """
-        before, after = (phi := self.features(image))[:, :-1], phi[:, 1:]
-        read = self.inverse(torch.cat([before, after], -1))
-        foreseen = self.dynamics(torch.cat([before, action[:, 1:]], -1))
-        return read, forward_error(foreseen, after)
-
-
-def forward_error(foreseen: Tensor, features: Tensor) -> Tensor:
-    """Pathak et al. (5), ½ ||φ^(o') - φ(o')||², and by (6) the curiosity: (..., F) -> (...)."""
-    return 0.5 * (foreseen - features).square().sum(-1)
-
-
-def icm_loss(
-    read: Tensor, action: Tensor, surprise: Tensor, within: Tensor, forward_share: float = 0.2
-) -> Tensor:
-    """Pathak et al. (7) without its policy: (1 - β) inverse loss + β forward loss.
-
-    :param read: (..., A), the inverse model's actions; continuous, so their error is squared
-    :param action: (..., A)
-    :param surprise: (...), of `forward_error`
-    :param within: (...) bool, False where the two images are of different episodes
-    """
-    assert read.shape == action.shape and surprise.shape == within.shape, (read.shape, within.shape)
-    each = (1 - forward_share) * (read - action).square().sum(-1) + forward_share * surprise
-    return (each * within).sum() / within.sum().clamp_min(1)
-
-
-class Ensemble(nn.Module):
-    """One-step models that differ in nothing but their first weights and agree where data are.
-
-    :param size: the widths
-    :param action_dim: the padded action width, A
-    :param outputs: width of what they predict, the encoded next image
-    """
-
-    def __init__(self, size: Size, action_dim: int, outputs: int, members: int = MEMBERS) -> None:
-        super().__init__()
-        inputs = size.deter + size.stoch * size.classes + action_dim
-        self.members = nn.ModuleList(
-            nn.Sequential(
-                LinearNorm(inputs, size.units),
-                LinearNorm(size.units, size.units),
-                Linear(size.units, outputs),
-            )
-            for _ in range(members)
-        )
-        self.scale = Scale()
-
-    def forward(self, feat: Tensor, action: Tensor) -> Tensor:
-        """(..., D + S*K), (..., A) -> (members, ..., outputs)."""
-        inputs = torch.cat([feat, action], -1)
-        return torch.stack([member(inputs) for member in self.members])
-
-
-def ensemble_loss(prediction: Tensor, target: Tensor, within: Tensor) -> Tensor:
-    """-log of Gaussians of fixed variance, up to constants, averaged over the members.
-
-    :param prediction: (members, ..., E)
-    :param target: (..., E); no gradient reaches it
-    :param within: (...) bool, False where the target is of another episode
-    """
-    error = (prediction - target.detach()).square().mean(-1)
-    return (error * within).sum() / (len(prediction) * within.sum()).clamp_min(1)
-
-
-def disagreement(prediction: Tensor) -> Tensor:
-    """Sekar et al. (1): the variance over the members, averaged: (members, ..., E) -> (...)."""
-    return prediction.var(0, correction=0).mean(-1)
 
 
 class CuriousLearner(Learner):

@@ -46,7 +46,8 @@ class Actor(nn.Module):
 
     def forward(self, embed: Tensor) -> Tensor:
         """(N, E) -> (N, A), the mean action in (-1, 1)."""
-        return self.layers(self.trunk(embed)).tanh()
+        mean: Tensor = self.layers(self.trunk(embed)).tanh()
+        return mean
 
 
 class Critic(nn.Module):
@@ -146,7 +147,7 @@ class DrQv2Policy(FramePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         clone_size: Size | None = None,
         channels: int = 32,

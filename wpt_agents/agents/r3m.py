@@ -62,7 +62,8 @@ class FrameFeatures(nn.Module):
 
     def features(self, image: Tensor) -> Tensor:
         """(N, 64, 64, 3) -> (N, Z)."""
-        return self.body(image[:, None] if self.backbone == "conv" else image)
+        features: Tensor = self.body(image[:, None] if self.backbone == "conv" else image)
+        return features
 
     def forward(self, frames: Tensor) -> Tensor:
         """(N, F, 64, 64, 3) uint8, or features (N, F, Z) of these images -> (N, F Z)."""

@@ -8,7 +8,7 @@ https://arxiv.org/abs/2311.05067).
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from gymnasium import spaces
@@ -123,7 +123,7 @@ class RLPDPolicy(FramePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         clone_size: Size | None = None,
         channels: int = 32,

@@ -201,8 +201,8 @@ class SavedAgent(KeywordAgent):
         :param include: likewise
         """
         dataset = str(self.dataset.path) if self.dataset is not None else None
-        about = self.description() | {"dataset": dataset}
-        model_files.write(path, about, self.policy, self.learner)
+        header = self.description() | {"dataset": dataset}
+        model_files.write(path, header, self.policy, self.learner)
 
     def description(self) -> dict[str, Any]:
         """Return what a model file says of this agent besides its tensors."""
@@ -226,7 +226,7 @@ class SavedAgent(KeywordAgent):
     ) -> Self:
         """Read a model file.
 
-        :param path: the path given to `save`, or the name of a pre-trained world model that comes
+        :param path: the path passed to `save`, or the name of a pre-trained world model that comes
             with the library, such as "metaworld-mid"
         :param env: the environment to continue with
         :param custom_objects: accepted because SB3 has it
@@ -239,27 +239,27 @@ class SavedAgent(KeywordAgent):
         cls.check_keywords(kwargs)
         if print_system_info:
             get_system_info()
-        about, tensors = read_model(path)
-        own = cls.saved_as or cls.__name__
-        kind = about.get("class", own)
-        if kind != own:
+        header, tensors = read_model(path)
+        expected = cls.saved_as or cls.__name__
+        kind = header.get("class", expected)
+        if kind != expected:
             raise ValueError(
                 f"{path} is of {kind}: read it by {kind}.load, not {cls.__name__}.load"
             )
         agent = cls(
-            device=device, _init_setup_model=False, **{**about["hyperparameters"], **kwargs}
+            device=device, _init_setup_model=False, **{**header["hyperparameters"], **kwargs}
         )
-        agent.action_space = space_from_dict(about["action_space"])
+        agent.action_space = space_from_dict(header["action_space"])
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
-        agent.restore(about, tensors, cls.shape_keywords)
+        agent.restore(header, tensors, cls.shape_keywords)
         if env is not None:
             agent.set_env(env, force_reset)
         return agent
 
     def restore(
         self,
-        about: Mapping[str, Any],
+        header: Mapping[str, Any],
         tensors: Mapping[str, Mapping[str, Tensor]],
         same: tuple[str, ...],
     ) -> None:
@@ -267,8 +267,8 @@ class SavedAgent(KeywordAgent):
 
         :param same: keywords that must be equal here and in the file
         """
-        model_files.check_same(about, self.hyperparameters.as_dict(), same)
-        progress = self.progress_class.of(about["counters"])
+        model_files.check_same(header, self.hyperparameters.as_dict(), same)
+        progress = self.progress_class.of(header["counters"])
         model_files.restore(tensors, self.policy, self.learner)
         self.progress = progress
 
@@ -282,8 +282,8 @@ class SavedAgent(KeywordAgent):
         if isinstance(load_path_or_dict, dict):
             super().set_parameters(load_path_or_dict, exact_match, device)
             return
-        about, tensors = read_model(model_files.find(load_path_or_dict))
-        model_files.check_same(about, self.hyperparameters.as_dict(), self.shape_keywords)
+        header, tensors = read_model(model_files.find(load_path_or_dict))
+        model_files.check_same(header, self.hyperparameters.as_dict(), self.shape_keywords)
         model_files.restore(tensors, self.policy, self.learner)
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:

@@ -265,8 +265,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
-            found = self.learner.update(batch, generator, imitation, head_start)
-        for name, value in found.items():
+            update = self.learner.update(batch, generator, imitation, head_start)
+        for name, value in update.items():
             metrics[name].append(value)
         progress.updates += 1
         progress.task_updates += 1

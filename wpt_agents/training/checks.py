@@ -1,4 +1,4 @@
-"""Refusals: what WPT cannot act in or learn from, each naming what came and what would do."""
+"""Refuse what WPT cannot learn from; every error names the culprit and the remedy."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from wpt_agents.training.spaces import IMAGE_SHAPE
 
 
 def check_device(device: torch.device | str) -> None:
-    """Refuses a device that torch cannot compute on here, instead of falling back to the CPU."""
+    """Refuse a device that torch cannot compute on here, instead of falling back to the CPU."""
     if device == "auto":
         return
     try:
@@ -23,7 +23,7 @@ def check_device(device: torch.device | str) -> None:
 
 
 def check_images(dataset: TrajectoryDataset) -> None:
-    """Refuses a dataset that shows WPT nothing, or images of another size."""
+    """Refuse a dataset without trajectories, or with images of another size."""
     if len(dataset) == 0:
         raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
     if dataset.image_size != IMAGE_SIZE:
@@ -35,9 +35,10 @@ def check_images(dataset: TrajectoryDataset) -> None:
 
 
 def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
-    """Refuses a dataset that WPT cannot learn from."""
+    """Refuse a dataset that WPT cannot learn from."""
     check_images(dataset)
-    widest, longest = max(dataset.action_dims), max(dataset.lengths) + 1
+    widest = max(dataset.action_dims)
+    longest = max(dataset.lengths) + 1
     if widest > max_action_dim:
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model at most "
@@ -51,7 +52,7 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
 
 
 def check_trajectory(trajectory: Trajectory, max_action_dim: int) -> None:
-    """Refuses a trajectory that a model cannot look at."""
+    """Refuse a trajectory that a model cannot look at."""
     if trajectory.image.shape[1:] != IMAGE_SHAPE:
         raise ValueError(f"The trajectory's images are {trajectory.image.shape[1:]}: resize to 64")
     if trajectory.action_dim > max_action_dim:
@@ -62,10 +63,10 @@ def check_trajectory(trajectory: Trajectory, max_action_dim: int) -> None:
 
 
 def check_rewards(rewards: np.ndarray, step: int) -> None:
-    """Refuses rewards that are not finite, before anything of them is stored."""
+    """Refuse rewards that are not finite, before they are stored."""
     if not np.isfinite(rewards).all():
         i = int(np.flatnonzero(~np.isfinite(rewards))[0])
         raise ValueError(
             f"Environment {i} returned the reward {rewards[i]} at step {step}; nothing of this "
-            "episode was stored: mend the environment's reward"
+            "episode was stored: correct the environment's reward"
         )

@@ -40,30 +40,30 @@ class World:
 
     @classmethod
     def current(cls) -> "World":
-        """As `torch.distributed` is set up; one process alone where it is not."""
+        """Return the processes that `torch.distributed` connects, or this one alone."""
         if dist.is_available() and dist.is_initialized():
             return cls(dist.get_rank(), dist.get_world_size())
         return cls()
 
     def share(self, rows: int) -> slice:
-        """The part of so many rows that is this process's."""
-        own = rows // self.size
-        return slice(self.rank * own, (self.rank + 1) * own)
+        """Return this process's part of some rows."""
+        part = rows // self.size
+        return slice(self.rank * part, (self.rank + 1) * part)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Of what the processes hold; without gradient."""
+        """Return the mean of the processes' values, without gradient."""
         if self.size > 1:
             value = value / self.size
             dist.all_reduce(value)
         return value
 
     def barrier(self) -> None:
-        """Waits for all."""
+        """Wait until every process is here."""
         if self.size > 1:
             dist.barrier()
 
     def rank_0s(self, value: T) -> T:
-        """What rank 0 gives here."""
+        """Broadcast rank 0's value to every process."""
         box = [value]
         if self.size > 1:
             dist.broadcast_object_list(box)
@@ -71,7 +71,7 @@ class World:
 
     @contextmanager
     def rank_0_first(self) -> Iterator[None]:
-        """Lets rank 0 do the block before the others, who find there what it made."""
+        """Run the block in rank 0 before the others, which then find what it made."""
         if self.rank > 0:
             self.barrier()
         try:
@@ -81,7 +81,7 @@ class World:
                 self.barrier()
 
     def check_same(self, facts: dict[str, Any]) -> None:
-        """Refuses processes that are about to do different things.
+        """Refuse processes that were called with different arguments.
 
         :raises ValueError: naming what differs; in all of them
         """
@@ -89,22 +89,22 @@ class World:
         if self.size > 1:
             dist.all_gather_object(everyones, facts)
         for name in facts:
-            found = [each[name] for each in everyones]
-            if any(value != found[0] for value in found):
+            values = [everyone[name] for everyone in everyones]
+            if any(value != values[0] for value in values):
                 raise ValueError(
-                    f"The processes differ in {name}, by rank: {found}. Give all the same call, "
+                    f"The processes differ in {name}, by rank: {values}. Give all the same call, "
                     "with dataset and run_dir in folders that all of them see"
                 )
 
 
 def started_by_torchrun() -> bool:
-    """Or by something else that sets the same variables, and with others."""
+    """Return whether torchrun, or what sets the same variables, started several processes."""
     return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
 @contextmanager
 def joined(device: torch.device) -> Iterator[World]:
-    """The processes that `torchrun` started with this one, connected while the block runs.
+    """Connect the processes that `torchrun` started with this one while the block runs.
 
     They stay connected if they are already. Without torchrun this process is alone.
     """
@@ -114,8 +114,9 @@ def joined(device: torch.device) -> Iterator[World]:
     gpu = device if device.type == "cuda" else None
     if gpu:
         torch.cuda.set_device(gpu)  # objects, too, are sent by way of it
-    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
-    backend, store = "nccl" if gpu else "gloo", dist.PrefixStore(_meeting(), store)
+    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))  # type: ignore[attr-defined]
+    backend = "nccl" if gpu else "gloo"
+    store = dist.PrefixStore(_meeting(), store)  # type: ignore[attr-defined]
     dist.init_process_group(
         backend, store=store, rank=rank, world_size=size, timeout=PATIENCE, device_id=gpu
     )
@@ -129,16 +130,16 @@ _meetings = count()
 
 
 def _meeting() -> str:
-    """A name of its own for each time that the processes connect.
+    """Return a new name for each time that the processes connect.
 
-    Under another's name they would find the addresses of connections that are closed.
+    Under a name that was used before they would find the addresses of closed connections.
     """
     restarts = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
     return f"wpt-{restarts}-{next(_meetings)}"
 
 
 def local_device(device: torch.device | str = "auto") -> torch.device:
-    """As SB3 reads it, but that torchrun's processes get a GPU each unless one is named."""
+    """Return the device as SB3 does; torchrun's processes get one GPU each unless one is named."""
     device = get_device(device)
     if device.type == "cuda" and device.index is None and "LOCAL_RANK" in os.environ:
         return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
@@ -170,15 +171,19 @@ class Divided:
                 f"batch_size={batch_size} cannot be divided over {world.size} processes of "
                 f"accumulate={passes} passes each: it must be a multiple of their product"
             )
-        self.model, self.world, self.passes = model, world, passes
-        self.batch_size, self.autocast, self.options = batch_size, autocast, options
+        self.model = model
+        self.world = world
+        self.passes = passes
+        self.batch_size = batch_size
+        self.autocast = autocast
+        self.options = options
         self.objective: nn.Module = _Objective(model, options)
         if world.size > 1:
             with frozen(model.reward_head):  # DDP waits for the gradients of all else
                 self.objective = DistributedDataParallel(self.objective)
 
     def backward(self, share: Batch, device: torch.device, seed: int) -> WorldModelLoss:
-        """Adds the whole batch's gradients to the weights' and returns its losses.
+        """Add the whole batch's gradients to the weights' gradients and return its losses.
 
         :param share: this process's rows, `World.share` of them
         :param seed: of the random draws, the same in all processes
@@ -201,7 +206,7 @@ class Divided:
         return generator
 
     def _in_step(self, last: bool) -> AbstractContextManager[None]:
-        """The processes add up their gradients once an update, in the last pass."""
+        """Return a context in which gradients are added up over processes in the last pass only."""
         if last or not isinstance(self.objective, DistributedDataParallel):
             return nullcontext()
         return self.objective.no_sync()
@@ -229,7 +234,8 @@ class _Objective(nn.Module):
 
     def __init__(self, model: WorldModel, options: dict[str, Any]) -> None:
         super().__init__()
-        self.model, self.options = model, options
+        self.model = model
+        self.options = options
 
     def forward(
         self, batch: Batch, draws: Share, whole: Callable[[Tensor], Tensor]

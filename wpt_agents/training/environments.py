@@ -216,4 +216,5 @@ def last_observation(
             "return observation.copy(), as the agent cannot copy in another process",
             stacklevel=2,
         )
-    return last
+    observation: np.ndarray = last
+    return observation

@@ -1,6 +1,6 @@
-"""Execution guidance: how often, and for which steps of an episode, the prior actor drives.
+"""Execution guidance: how often, and for which steps of an episode, the prior actor acts.
 
-Also the schedules, by which guidance and kickstarting fade out.
+Also the schedules by which guidance and kickstarting fade out.
 """
 
 import math
@@ -11,11 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 Schedule = Callable[[int], float]
-SHARES = np.arange(1, 11) / 10  # a window lasts 10 %, 20 %, ... or 100 % of the episode
+SHARES = np.arange(1, 11) / 10  # a window is 10 %, 20 %, ... or 100 % of the episode
 
 
 def linear(start: float, end: float, duration: float) -> Schedule:
-    """From `start` to `end` over `duration` steps, constant afterwards.
+    """Return a schedule from `start` to `end` over `duration` steps, constant afterwards.
 
     The unit is the agent's step, a call of `env.step`: linear(1, 0, 50000) ends after 100,000
     frames at action repeat 2.
@@ -24,7 +24,7 @@ def linear(start: float, end: float, duration: float) -> Schedule:
 
 
 def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance") -> Schedule:
-    """'linear(1,0,50000)' or a constant -> the schedule.
+    """Read a schedule: 'linear(1,0,50000)', or a constant.
 
     :param most: the largest value allowed: 1 for a probability, infinite for a weight
     :param name: the keyword that the schedule is of
@@ -51,16 +51,16 @@ def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance")
 
 
 def ever(schedule: Schedule) -> bool:
-    """Whether it is ever above 0; schedules are monotonous."""
+    """Return whether a schedule is ever above 0. Schedules are monotonic: both ends are enough."""
     return schedule(0) > 0 or schedule(sys.maxsize) > 0
 
 
 def draw_window(probability: float, length: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Once an episode: the steps k .. k + H - 1 at which the prior actor drives.
+    """Draw the steps k .. k + H - 1 of an episode at which the prior actor acts.
 
     :param probability: of guiding this episode at all
-    :param length: steps an episode lasts
-    :return: (k, k + H), half-open; (0, 0) when it does not drive
+    :param length: steps of an episode
+    :return: (k, k + H), half-open; (0, 0) if the episode is not guided
     """
     if rng.random() >= probability:
         return 0, 0

@@ -225,10 +225,10 @@ class Hyperparameters(Keywords):
 
     def value(self, name: str) -> Any:
         """Return a keyword's value, the size's own where it is None."""
-        found = getattr(self, name)
-        if found is None and name in SIZES_OWN:
+        value = getattr(self, name)
+        if value is None and name in SIZES_OWN:
             return getattr(find_size(self.size), SIZES_OWN[name])
-        return found
+        return value
 
     def resolved(self) -> Self:
         """Return a copy in which the size's own values stand where None stood."""

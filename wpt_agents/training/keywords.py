@@ -180,15 +180,15 @@ class Keywords:
         return {item.name: item.metadata["keyword"] for item in fields(cls)}
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
+    def of(cls, values: Mapping[str, Any]) -> Self:
         """Make an instance of keywords by name.
 
         :raises ValueError: an unknown name, or a value that is not allowed
         """
-        for name in given:
+        for name in values:
             if name not in cls.declared():
                 raise unknown_name("keyword", name, cls.declared())
-        return cls(**given)
+        return cls(**values)
 
     @classmethod
     def of_stages(cls, *stages: Stage) -> frozenset[str]:

@@ -21,14 +21,14 @@ def optimizers(learner: object) -> dict[str, Optimizer]:
     return {name: value for name, value in vars(learner).items() if isinstance(value, Optimizer)}
 
 
-def write(path: ModelPath, about: Mapping[str, Any], policy: BasePolicy, learner: object) -> None:
+def write(path: ModelPath, header: Mapping[str, Any], policy: BasePolicy, learner: object) -> None:
     """Write a model file, whole or not at all. The suffix .zip is added where there is none."""
     if isinstance(path, str | os.PathLike) and not Path(path).suffix:
         path = Path(path).with_suffix(".zip")
     weights = policy.state_dict()  # of which compiled parts have other names
     tensors = {"policy": {name.replace("_orig_mod.", ""): w for name, w in weights.items()}}
     tensors |= {name: optimizer_tensors(value) for name, value in optimizers(learner).items()}
-    write_model(path, about, tensors)
+    write_model(path, header, tensors)
 
 
 def restore(
@@ -46,11 +46,11 @@ def restore(
         load_optimizer(value, tensors[name])
 
 
-def write_world_model(path: ModelPath, about: Mapping[str, Any], policy: BasePolicy) -> None:
+def write_world_model(path: ModelPath, header: Mapping[str, Any], policy: BasePolicy) -> None:
     """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share."""
     kept = tuple(f"world_model.{part}." for part in ("encoder", "rssm", "decoder"))
     weights = {k: w.bfloat16() for k, w in policy.state_dict().items() if k.startswith(kept)}
-    write_model(path, about, {WORLD_MODEL: weights})
+    write_model(path, header, {WORLD_MODEL: weights})
 
 
 def shipped() -> dict[str, Path]:
@@ -61,14 +61,14 @@ def shipped() -> dict[str, Path]:
 
 
 def check_same(
-    about: Mapping[str, Any], hyperparameters: Mapping[str, Any], names: tuple[str, ...]
+    header: Mapping[str, Any], hyperparameters: Mapping[str, Any], names: tuple[str, ...]
 ) -> None:
     """Refuse to load weights that were trained with other values of some keywords.
 
     :raises ValueError: naming both values
     """
     for name in names:
-        was = about["hyperparameters"][name]
+        was = header["hyperparameters"][name]
         now = hyperparameters[name]
         if was != now:
             raise ValueError(

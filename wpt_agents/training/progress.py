@@ -35,16 +35,16 @@ class Progress:
 
         :raises ValueError: naming the counters that are missing
         """
-        found = {RENAMED.get(name, name): value for name, value in saved.items()}
+        counters = {RENAMED.get(name, name): value for name, value in saved.items()}
         names = {item.name for item in fields(cls)}
         earlier = {i.name: i.metadata["earlier"] for i in fields(cls) if "earlier" in i.metadata}
-        found = earlier | {name: value for name, value in found.items() if name in names}
-        if missing := names - found.keys():
+        counters = earlier | {name: value for name, value in counters.items() if name in names}
+        if missing := names - counters.keys():
             raise ValueError(
                 f"The model file lacks {', '.join(sorted(missing))}: it was written by an earlier "
                 "version of wpt_agents. Train the model again, or load it with that version"
             )
-        return cls(**found)
+        return cls(**counters)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counters by name, as model files hold them."""

@@ -38,12 +38,12 @@ def retrieve_ids(
         )
     if settings.retrieval == "random":
         rng = streams.numpy(Purpose.RETRIEVE, 0)
-        found = retriever.draw(settings.num_retrieve, rng, known, width)
+        numbers = retriever.draw(settings.num_retrieve, rng, known, width)
     else:
-        found, _ = retriever.search(query, settings.num_retrieve, known, width)
-    if len(found) == 0:
+        numbers, _ = retriever.search(query, settings.num_retrieve, known, width)
+    if len(numbers) == 0:
         raise ValueError(
             f"The dataset {dataset.path} has no trajectory of {width} actions to retrieve; add "
             "some, or learn with offline_ratio=0, guidance=0, kickstart=0"
         )
-    return [int(i) for i in found]
+    return [int(i) for i in numbers]

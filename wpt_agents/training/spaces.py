@@ -57,7 +57,7 @@ def check_observations(env: VecEnv) -> None:
         warnings.warn(resize_message(height, width, IMAGE_SIZE), stacklevel=4)
 
 
-def is_image(space: spaces.Space, channels: int | None = None) -> bool:
+def is_image(space: spaces.Space[Any], channels: int | None = None) -> bool:
     """Return whether a space is of uint8 images, with this number of channels unless it is None."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
@@ -99,7 +99,7 @@ def _culprit(env: VecEnv, channels: int | None = None) -> str | None:
     return None
 
 
-def observation_remedy(space: spaces.Space) -> str:
+def observation_remedy(space: spaces.Space[Any]) -> str:
     """Return the line of code that turns observations of this space into images."""
     if isinstance(space, spaces.Dict):
         keys = ", ".join(map(repr, space.spaces))
@@ -153,7 +153,7 @@ def _observe(name: str, formula: str, shape: tuple[int, ...]) -> str:
 # ------------------------------------------------------------------------------------ actions
 
 
-def check_actions(space: spaces.Space, max_action_dim: int | None) -> None:
+def check_actions(space: spaces.Space[Any], max_action_dim: int | None) -> None:
     """Refuse actions that are no flat Box with finite bounds, or that are too many."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(
@@ -174,7 +174,7 @@ def check_actions(space: spaces.Space, max_action_dim: int | None) -> None:
         )
 
 
-def action_remedy(space: spaces.Space) -> str:
+def action_remedy(space: spaces.Space[Any]) -> str:
     """Return the line of code that turns actions of this space into a flat Box."""
     if isinstance(space, spaces.Box):
         formula = f"action.reshape({space.shape})"
@@ -202,7 +202,7 @@ def action_remedy(space: spaces.Space) -> str:
     return "wrap it with gymnasium.wrappers.TransformAction so that it takes a one-dimensional Box"
 
 
-def _members(space: spaces.Space) -> list[spaces.Space]:
+def _members(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
     if isinstance(space, spaces.Dict):
         return list(space.spaces.values())
     return list(space.spaces) if isinstance(space, spaces.Tuple) else []

@@ -450,7 +450,7 @@ def test_the_csv_reads_back_unrounded():
         (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
         (["collect", "--out", "data", "--behaviour", "icn"], "Did you mean 'icm'"),
         (["collect", "--out", "data", "--behaviour", "icm", "--set", "gama=1"], "mean 'gamma'"),
-        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma is a"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma must be a"),
         (["run", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
         (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
         (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),

@@ -256,7 +256,7 @@ def test_an_episode_depends_on_its_number_and_on_none_before_it():
 
 
 SCRIPT = """
-import sys; sys.path.insert(0, {tests!r})
+import sys; sys.path[:0] = {tests!r}
 from pathlib import Path
 import test_zoo, gymnasium
 from wpt_envs.tasks import TASKS
@@ -270,9 +270,9 @@ test_zoo.run(test_zoo.job(Path({out!r}), **CHANGES))
 def test_sigkill_at_random_moments_costs_nothing_that_was_kept(tmp_path):
     whole, broken = job(tmp_path / "whole", **CHANGES), job(tmp_path / "broken", **CHANGES)
     run(whole)
-    script = SCRIPT.format(
-        tests=str(Path(__file__).parents[1] / "helpers"), out=str(tmp_path / "broken")
-    )
+    here = Path(__file__).parent
+    folders = [str(here), str(here.parent / "helpers")]
+    script = SCRIPT.format(tests=folders, out=str(tmp_path / "broken"))
     rng, monitor = random.Random(0), broken.folder / "0.monitor.csv"
     for episodes in (1, 2, 4, None):  # after which it is killed, at some moment of the next one
         child = subprocess.Popen(

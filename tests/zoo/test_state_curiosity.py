@@ -70,7 +70,7 @@ def test_five_stages_are_recorded_in_turn_and_depend_on_the_seed_alone(tmp_path)
         )
 
     one, other = recorded("one", 1), recorded("other", 2)
-    assert [source[-11:] for source in one.sources[:2]] == ["tage 1 of 5", "tage 2 of 5"]
+    assert [source[-12:] for source in one.sources[:2]] == ["stage 1 of 5", "stage 2 of 5"]
     assert one.sources[5] == one.sources[0]
     for i in range(6):
         assert (one[i].action == other[i].action).all() and (one[i].image == other[i].image).all()

@@ -78,7 +78,7 @@ class PictureReader:
 
 
 def shrink(picture: np.ndarray, size: int) -> np.ndarray:
-    """Average over areas, so that thin lines stay; what is not square is squeezed.
+    """Average over areas, which keeps thin lines. Pictures that are not square are squeezed.
 
     :param picture: (H, W, 3) uint8
     :return: (size, size, 3) uint8

@@ -265,3 +265,9 @@ def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_pat
     given = "dmc", ["walker-run"], "debug", "1", methods, settings
     [one] = make_plan(*given, tmp_path, 1, "cpu")
     assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
+
+
+def test_an_empty_value_trains_the_shipped_model_again():
+    shipped = load_preset("metaworld", "mid").pretrain
+    assert shipped.model == "metaworld-mid"
+    assert load_preset("metaworld", "mid", ["pretrain.model="]).pretrain.model == ""

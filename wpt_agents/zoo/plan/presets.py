@@ -281,6 +281,6 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
         dotted |= {f"{name}.{k}" for name, agent in AGENTS.items() for k in defaults(agent)}
         raise unknown_name("key for --set", key, {*wpt_keywords(), *dotted})
     try:
-        return {title or "wpt": {key: read_yaml(value)}}
+        return {title or "wpt": {key: read_yaml(value) if value.strip() else ""}}
     except yaml.YAMLError:
         raise ValueError(f"--set {key}: {value!r} is no valid YAML value.") from None

@@ -28,9 +28,8 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.observations import stack_frames
 from wpt_agents.model.ops import definitions
-from wpt_agents.model.prior_policy import prior_action
+from wpt_agents.model.policy import prior_action, stack_frames
 from wpt_agents.training import cloning, pretraining
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.randomness import Purpose
@@ -385,6 +384,24 @@ def test_the_head_start_is_made_at_once_and_what_was_earned_counts_towards_it():
     assert model.updates == 10
     model.learn(7, reset_num_timesteps=False)  # 7 * 4 / 8 = 3.5 more
     assert model.updates == 13
+
+
+def test_the_rates_of_actor_and_critic_fall_over_a_call_of_learn():
+    rates = []
+    model = agent(ClockEnv(length=7), actor_critic_decay=True, learning_starts=7, train_ratio=4)
+    model.actor_critic_learning_rate = 0.1
+
+    class Note(BaseCallback):
+        def _on_step(self):
+            optimizers = model.learner.actor_optimizer, model.learner.critic_optimizer
+            rates.append([o.param_groups[0]["lr"] for o in optimizers])
+            return True
+
+    model.learn(28, callback=Note())
+    assert rates[6] == pytest.approx([0.1, 0.1])  # before the first update
+    # the updates after step 7 use 1 - 7 / 28 of it, those after step 21 a quarter
+    assert rates[7] == pytest.approx([0.075, 0.075])
+    assert rates[-1] == pytest.approx([0.025, 0.025])
 
 
 def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):

@@ -259,6 +259,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.streams.numpy(Purpose.UPDATE, progress.updates),
             settings.recent_share,
         ).to(self.device)
+        if settings.actor_critic_decay:
+            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
         head_start = progress.task_updates < settings.actor_delay
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:

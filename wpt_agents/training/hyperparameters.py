@@ -113,6 +113,11 @@ class Hyperparameters(Keywords):
     actor_critic_learning_rate: float | None = amount(
         None, "of actor and critic; the size's own if None"
     )
+    actor_critic_decay: bool = switch(
+        False,
+        "let the learning rate of actor and critic fall linearly to 0 over a call of `learn`, so "
+        "that the last policy is not the result of a few noisy updates; not in the paper",
+    )
     gamma: float = share(0.99, "discount factor")
     lam: float = share(0.95, "λ of Eq. (2)")
     ent_coef: float = amount(1e-4, "η of Eq. (4), the weight of the entropy")

@@ -74,11 +74,14 @@ class Learner:
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
         self.hyperparameters = hyperparameters.resolved()
-        rate = float(self.hyperparameters.value("learning_rate"))
-        actor_critic_rate = self.hyperparameters.value("actor_critic_learning_rate")
-        self.set_rate(self.model_optimizer, rate)
-        self.set_rate(self.actor_optimizer, actor_critic_rate)
-        self.set_rate(self.critic_optimizer, actor_critic_rate)
+        self.set_rate(self.model_optimizer, float(self.hyperparameters.value("learning_rate")))
+        self.set_actor_critic_rate(1.0)
+
+    def set_actor_critic_rate(self, share: float) -> None:
+        """Set the learning rates of actor and critic to a share of their keyword."""
+        rate = share * self.hyperparameters.value("actor_critic_learning_rate")
+        self.set_rate(self.actor_optimizer, rate)
+        self.set_rate(self.critic_optimizer, rate)
 
     def set_rate(self, optimizer: Optimizer, rate: float) -> None:
         """Set an optimiser's learning rate and weight decay."""

@@ -28,8 +28,9 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.observations import stack_frames
 from wpt_agents.model.ops import definitions
-from wpt_agents.model.policy import prior_action, stack_frames
+from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.training import cloning, pretraining
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.randomness import Purpose

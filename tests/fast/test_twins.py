@@ -103,6 +103,12 @@ def decoded(patch):
     return Example(lambda: (decoder, state, image), [*state, *decoder.parameters()])
 
 
+def shifts(patch):
+    image = torch.randint(256, (5, 3, 8, 9, 3), dtype=torch.uint8)
+    shift = torch.tensor([[0, 0], [3, -3], [-3, 3], [2, 1], [-1, -2]])
+    return Example(lambda: (image, shift, 3), tolerance=0)
+
+
 def acting(patch):
     policy, n = agent().policy, 3
     image = torch.randint(256, (n, 64, 64, 3), dtype=torch.uint8)
@@ -159,6 +165,7 @@ EXAMPLES = {
     "over_rows_in_pieces": pieces_of(64),
     "over_steps_one_by_one": steps,
     "scan": sequence,
+    "shifted_by_cuts": shifts,
     "acting_step_with_copies": acting,
     "compiled_filter_step": compiled_step,
     "compiled_imagine": compiled_dream,
@@ -214,7 +221,7 @@ NO_GRADIENT = (torch.no_grad, torch.inference_mode)
 def test_every_module_of_the_folder_registers_its_twins():
     assert {twin.__module__ for _, _, twin in TWINS.values()} == {
         f"{wpt_agents.fast.__name__}.{name}"
-        for name in ("acting", "compiled", "convolutions", "pieces", "products", "scan")
+        for name in ("acting", "compiled", "convolutions", "pieces", "products", "scan", "shifts")
     }
 
 

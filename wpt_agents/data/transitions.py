@@ -52,8 +52,16 @@ def random_shift(image: np.ndarray, pad: int, rng: np.random.Generator) -> np.nd
     :param image: (N, F, H, W, C)
     :return: (N, F, H, W, C), the frames of one stack shifted alike
     """
+    return cut_shifted(image, rng.integers(0, 2 * pad + 1, (len(image), 2)), pad)
+
+
+def cut_shifted(image: np.ndarray, offset: np.ndarray, pad: int) -> np.ndarray:
+    """Widen each stack of frames by `pad` border pixels and cut out images of the former size.
+
+    :param image: (N, F, H, W, C)
+    :param offset: (N, 2) int, from 0 to 2 * pad: the first row and column to cut out
+    """
     n, frames, height, width, colours = image.shape
-    offset = rng.integers(0, 2 * pad + 1, (n, 2))
     middle = slice(pad, pad + height), slice(pad, pad + width)
     padded = np.empty((n, frames, height + 2 * pad, width + 2 * pad, colours), image.dtype)
     padded[:, :, middle[0], middle[1]] = image

@@ -6,3 +6,4 @@ from wpt_agents.fast import convolutions as convolutions
 from wpt_agents.fast import pieces as pieces
 from wpt_agents.fast import products as products
 from wpt_agents.fast import scan as scan
+from wpt_agents.fast import shifts as shifts

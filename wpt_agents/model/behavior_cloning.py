@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.images import Encoder
 from wpt_agents.model.layers import Linear, LinearNorm
+from wpt_agents.model.ops import op
 from wpt_agents.model.sizes import Size
 
 FRAMES = 3  # a single image does not show velocities
@@ -53,8 +54,20 @@ def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None
 
     :param image: (N, F, H, W, C)
     """
+    shape = len(image), 2
+    shift = torch.randint(-pad, pad + 1, shape, device=image.device, generator=generator)
+    return shifted(image, shift, pad)
+
+
+@op
+def shifted(image: Tensor, shift: Tensor, pad: int) -> Tensor:
+    """Let pixel (i, j) of each stack be its former pixel (i + y, j + x), or the border's nearest.
+
+    :param image: (N, F, H, W, C)
+    :param shift: (N, 2) int, y and x of each stack
+    :param pad: the largest entry of `shift`
+    """
     n, _, height, width, _ = image.shape
-    shift = torch.randint(-pad, pad + 1, (n, 2), device=image.device, generator=generator)
     rows = (torch.arange(height, device=image.device) + shift[:, :1]).clamp(0, height - 1)
     columns = (torch.arange(width, device=image.device) + shift[:, 1:]).clamp(0, width - 1)
     index = torch.arange(n, device=image.device)[:, None, None]

@@ -405,6 +405,40 @@ def test_the_rates_of_actor_and_critic_fall_over_a_call_of_learn():
     assert rates[-1] == pytest.approx([0.025, 0.025])
 
 
+def test_the_average_of_the_actors_since_the_head_start_acts(tmp_path):
+    settings = {"learning_starts": 7, "train_ratio": 4, "actor_delay": 3, "actor_average": 0.25}
+    model = agent(ClockEnv(length=7), **settings)
+    actors = []
+
+    def note(update):
+        def noted(*args, **kwargs):
+            metrics = update(*args, **kwargs)
+            actors.append([weight.clone() for weight in model.policy.actor.parameters()])
+            return metrics
+
+        return noted
+
+    model.learner.update = note(model.learner.update)
+    model.learn(7)  # 3.5 updates are due: the head start
+    assert len(actors) == 3 and model.policy.average_actor is None
+    model.learn(14, reset_num_timesteps=False)
+    assert len(actors) == 10
+    weights = 0.75 ** torch.arange(6.0, -1, -1)
+    weights = weights / weights.sum()
+    for averaged, *values in zip(model.policy.average_actor.parameters(), *actors[3:], strict=True):
+        expected = sum(w * value for w, value in zip(weights, values, strict=True))
+        torch.testing.assert_close(averaged, expected)
+    image = np.zeros((64, 64, 3), np.uint8)
+    action, _ = model.predict(image, deterministic=True)
+    model.save(tmp_path / "model.zip")
+    loaded = WPT.load(tmp_path / "model.zip")
+    assert np.array_equal(loaded.predict(image, deterministic=True)[0], action)
+    model.policy.actor.load_state_dict(model.policy.average_actor.state_dict())
+    model.policy.average(0)
+    with definitions():
+        assert np.allclose(model.predict(image, deterministic=True)[0], action, atol=1e-6)
+
+
 def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):
     rates = []
     model = pretrained(store, env=DotEnv(), guidance=1, bc_steps=4, bc_learning_rate=0.1)

@@ -14,6 +14,7 @@ from wpt_agents.model.actor_critic import (
     Critic,
     actor_loss,
     critic_loss,
+    debiased_fraction,
     discounts,
     draw_starts,
     ema_update,
@@ -256,6 +257,16 @@ def test_ema_by_hand():
     assert target.weight.item() == pytest.approx(1.04)
     assert target.bias.item() == pytest.approx(-1.04)
     assert source.weight.item() == 3.0
+
+
+def test_a_debiased_average_weighs_the_last_values_by_powers_of_1_minus_f():
+    values = [3.0, -1.0, 4.0, 10.0]
+    average = 100.0  # where it began does not matter
+    for n, value in enumerate(values, 1):
+        average += debiased_fraction(0.25, n) * (value - average)
+    # weights 0.75^3, 0.75^2, 0.75, 1: (27 * 3 - 36 + 48 * 4 + 64 * 10) / (27 + 36 + 48 + 64)
+    assert average == pytest.approx(877 / 175)
+    assert debiased_fraction(1.0, 3) == 1
 
 
 def test_the_target_critic_starts_as_the_critic_and_moves_by_ema_alone():

@@ -76,10 +76,6 @@ class KeywordAgent(BaseAlgorithm):
 
         def __getattr__(self, name: str) -> Any: ...
 
-    if TYPE_CHECKING:  # keywords are attributes
-
-        def __getattr__(self, name: str) -> Any: ...
-
     def change_hyperparameter(self, name: str, value: Any) -> None:
         """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
 

@@ -25,6 +25,7 @@ from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
 from wpt_agents.data.units import in_units_of
 from wpt_agents.files.model_file import read_model
+from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.model.sizes import Size
 from wpt_agents.training import pretraining
@@ -271,8 +272,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             update = self.learner.update(batch, generator, imitation, head_start)
         for name, value in update.items():
             metrics[name].append(value)
+        self.policy.average(self.averaging())
         progress.updates += 1
         progress.task_updates += 1
+
+    def averaging(self) -> float:
+        """Return by how much the average actor moves now: it begins after the head start."""
+        number = self.progress.task_updates - self.hyperparameters.actor_delay + 1
+        share = self.hyperparameters.actor_average
+        return debiased_fraction(share, number) if share and number > 0 else 0.0
 
     # The data and the task
 

@@ -78,7 +78,7 @@ _fast_steps: WeakKeyDictionary[WPTPolicy, FastStep] = WeakKeyDictionary()
 
 def networks_of(policy: WPTPolicy) -> tuple[Encoder, RSSM, Actor]:
     """Return the networks that act."""
-    return policy.world_model.encoder, policy.world_model.rssm, policy.actor
+    return policy.world_model.encoder, policy.world_model.rssm, policy.acting_actor
 
 
 def fast_step(policy: WPTPolicy) -> FastStep:

@@ -104,6 +104,18 @@ def ema_update(target: nn.Module, source: nn.Module, fraction: float = 0.02) -> 
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), fraction)
 
 
+def debiased_fraction(fraction: float, n: int) -> float:
+    """Return by how much the average of n values moves to the n-th, f / (1 - (1 - f)^n).
+
+    The k-th of n values then weighs (1 - f)^(n - k), divided by the sum of these weights: an
+    exponential average without the value that it began with. Source: Algorithm 1 of
+    https://arxiv.org/abs/1412.6980
+
+    :param n: 1 for the first value, which replaces whatever was there
+    """
+    return fraction / (1 - (1 - fraction) ** n)
+
+
 class Actor(Head):
     """π(a | s): a truncated normal with tanh means and standard deviations from 0.1 to 1.
 

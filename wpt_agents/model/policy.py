@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actions import to_bounds
-from wpt_agents.model.actor_critic import Actor, Critic
+from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import PriorActor
 from wpt_agents.model.distributions import Noise
 from wpt_agents.model.layers import frozen
@@ -51,6 +52,9 @@ class WPTPolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    average_actor: (
+        Actor | None
+    )  # a running average of `actor`, which acts in its place; not learned
     image_key: str | None = None  # the entry to see of Dict observations; their only image if None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
@@ -89,6 +93,7 @@ class WPTPolicy(BasePolicy):
         self.critic = Critic(size, self.zero_init_heads).to(device)
         self.target_critic = Critic(size).to(device).requires_grad_(False)
         self.target_critic.load_state_dict(self.critic.state_dict())
+        self.average_actor = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
         self.return_scale.fill_(0)
         self.updates += 1
@@ -96,8 +101,13 @@ class WPTPolicy(BasePolicy):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load weights, as `torch.nn.Module.load_state_dict`."""
+        """Load weights, as `torch.nn.Module.load_state_dict`.
+
+        Afterwards there is an average actor if the weights have one, and none otherwise.
+        """
         self.updates += 1
+        averaged = any(name.startswith("average_actor.") for name in state_dict)
+        self.average_actor = deepcopy(self.actor).requires_grad_(False) if averaged else None
         return super().load_state_dict(state_dict, strict, assign)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -109,6 +119,21 @@ class WPTPolicy(BasePolicy):
         """Act in this space from now on; entries past its width are masked everywhere."""
         self.action_space = action_space
         self.action_mask[:] = torch.arange(self.max_action_dim) < action_space.shape[0]
+
+    @property
+    def acting_actor(self) -> Actor:
+        """The actor that decides in the environment; dreams are always the actor's that learns."""
+        return self.actor if self.average_actor is None else self.average_actor
+
+    def average(self, fraction: float) -> None:
+        """Move the average actor towards the actor by `fraction`; 0 drops it."""
+        if not fraction:
+            self.average_actor = None
+        elif self.average_actor is None:
+            self.average_actor = deepcopy(self.actor).requires_grad_(False)
+        else:
+            ema_update(self.average_actor, self.actor, fraction)
+        self.updates += 1
 
     def initial_state(self, n: int) -> State:
         """Return the acting state of n new episodes: h (n, D), z (n, S, K), last action (n, A)."""
@@ -141,7 +166,7 @@ class WPTPolicy(BasePolicy):
         first = check_episode_start(episode_start, n)
         inputs = self._tensor(image), Latent(*latent), action, self._tensor(first)
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
-        dist = self.actor.truncated(outputs, self.action_mask)
+        dist = self.acting_actor.truncated(outputs, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
         state = tuple(x.cpu().numpy() for x in (*post, action))
         if not np.isfinite(state[-1]).all():
@@ -268,7 +293,7 @@ def acting_step(
         embed[:, None], action[:, None], is_first[:, None], state, generator, sample
     )
     post = post.flatten_time()
-    return post, policy.actor(post.feat)
+    return post, policy.acting_actor(post.feat)
 
 
 @op

@@ -118,6 +118,11 @@ class Hyperparameters(Keywords):
         "let the learning rate of actor and critic fall linearly to 0 over a call of `learn`, so "
         "that the last policy is not the result of a few noisy updates; not in the paper",
     )
+    actor_average: float = share(
+        0.0,
+        "share by which an average of the actors moves to the actor in an update. The average acts "
+        "and is evaluated, dreams are the actor's; not in the paper. 0: the actor itself acts",
+    )
     gamma: float = share(0.99, "discount factor")
     lam: float = share(0.95, "λ of Eq. (2)")
     ent_coef: float = amount(1e-4, "η of Eq. (4), the weight of the entropy")

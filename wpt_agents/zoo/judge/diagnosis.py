@@ -92,7 +92,7 @@ def _taken(actions: Tensor, _: Latent, t: int) -> Tensor:
 
 
 def _mode(policy: WPTPolicy, state: Latent) -> Tensor:
-    return policy.actor.dist(state.feat, policy.action_mask).mode
+    return policy.acting_actor.dist(state.feat, policy.action_mask).mode
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ def pixels(
     rendering: str | None = None,
     camera: "Camera | None" = None,
     image_key: str | None = None,
+    crop: bool = False,
     state_in_info: bool = False,
     render_size: int | None = None,
 ) -> gym.Env:
@@ -37,6 +38,8 @@ def pixels(
     :param camera: name, number or attributes of the camera to draw from, only together with
         `rendering`; the environment's own if None
     :param image_key: the entry of Dict observations that is the picture, in place of `render()`
+    :param crop: cut out the middle square of pictures that are not square; they are squeezed, with
+        a warning, if False. With `rendering` pictures are always square
     :param state_in_info: put the observation of `env` into `info["state"]`
     :param render_size: side of what `render()` returns; the last observation if None
     :raises ValueError: an environment that cannot be shown in this way
@@ -44,7 +47,7 @@ def pixels(
     >>> env = wpt_envs.pixels(gym.make("Ant-v5", render_mode="rgb_array"))
     """
     return dress(
-        _looked_at(env, rendering, camera, image_key),
+        _looked_at(env, rendering, camera, image_key, crop),
         image_size=image_size,
         action_repeat=action_repeat,
         pad_action_to=pad_action_to,
@@ -54,7 +57,11 @@ def pixels(
 
 
 def _looked_at(
-    env: gym.Env, rendering: str | None, camera: "Camera | None", image_key: str | None
+    env: gym.Env,
+    rendering: str | None,
+    camera: "Camera | None",
+    image_key: str | None,
+    crop: bool,
 ) -> gym.Env:
     if not isinstance(env, gym.Env):
         raise ValueError(f"pixels wraps one Gymnasium environment, not {_instead(env)}")
@@ -63,8 +70,12 @@ def _looked_at(
     if image_key is not None:
         if rendering is not None:
             raise ValueError("image_key and rendering are two ways to see: give one of them")
-        return _LookObserved(env, image_key)
-    return _LookRendered(env) if rendering is None else _LookDrawn(env, rendering, camera)
+        return _LookObserved(env, image_key, crop)
+    if rendering is None:
+        return _LookRendered(env, crop)
+    if crop:
+        raise ValueError(f"rendering={rendering!r} draws squares already: leave crop out")
+    return _LookDrawn(env, rendering, camera)
 
 
 def _instead(env: Any) -> str:
@@ -87,13 +98,14 @@ def _instead(env: Any) -> str:
 class _LookRendered(gym.Wrapper):
     """Looks by `env.render()`."""
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env, crop: bool = False) -> None:
         super().__init__(env)
         if env.render_mode != "rgb_array":
             raise ValueError(
                 f"{env} has render_mode={env.render_mode!r}; make it with render_mode='rgb_array'"
             )
-        self._reader = PictureReader(f"render() of {env}", "make it with render_mode='rgb_array'")
+        source = f"render() of {env}"
+        self._reader = PictureReader(source, "make it with render_mode='rgb_array'", crop)
 
     def look(self, size: int) -> np.ndarray:
         """The picture now: (size, size, 3) uint8."""
@@ -103,7 +115,7 @@ class _LookRendered(gym.Wrapper):
 class _LookObserved(gym.Wrapper):
     """Looks at one entry of the Dict observations."""
 
-    def __init__(self, env: gym.Env, image_key: str) -> None:
+    def __init__(self, env: gym.Env, image_key: str, crop: bool = False) -> None:
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
@@ -118,7 +130,7 @@ class _LookObserved(gym.Wrapper):
             )
         self._key, self._seen = image_key, np.zeros((1, 1, 3), np.uint8)
         source = f"The observation {image_key!r} of {env}"
-        self._reader = PictureReader(source, "choose another image_key")
+        self._reader = PictureReader(source, "choose another image_key", crop)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and keep its first picture."""

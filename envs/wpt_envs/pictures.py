@@ -1,5 +1,6 @@
 """Pictures as environments return them, checked, made (H, W, 3) uint8 and shrunk to a square."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,22 @@ class PictureReader:
 
     :param source: what returns the pictures, for messages, such as "render() of <CarRacing>"
     :param remedy: what to do if there is no picture at all
+    :param crop: cut out the middle square; otherwise the first picture that is not square causes a
+        warning, because `shrink` will squeeze it
     """
 
-    def __init__(self, source: str, remedy: str) -> None:
-        self.source, self.remedy = source, remedy
+    def __init__(self, source: str, remedy: str, crop: bool = False) -> None:
+        self.source = source
+        self.remedy = remedy
+        self.crop = crop
         self._scale: float | None = None  # of floats, once it is known
+        self._warned = False
 
     def read(self, picture: Any) -> np.ndarray:
         """Check and convert one picture.
 
         :param picture: (H, W, 3), or with one channel or four, or with the channels first
-        :return: (H, W, 3) uint8, a view where nothing had to be converted
+        :return: (H, W, 3) uint8, a view where nothing had to be converted; with `crop`, H = W
         :raises ValueError: anything else, by what it is
         """
         if picture is None or isinstance(picture, str | bytes | dict):
@@ -34,8 +40,24 @@ class PictureReader:
                 f"{self.source} returned a {type(picture).__name__} of {len(picture)}, not one "
                 f"picture as an array: return its last entry, or {self.remedy}"
             )
-        array = np.asarray(picture)
-        return self._bytes(self._colour(array))
+        array = self._colour(np.asarray(picture))
+        if self.crop:
+            array = middle_square(array)
+        else:
+            self._warn_of_squeezing(*array.shape[:2])
+        return self._bytes(array)
+
+    def _warn_of_squeezing(self, height: int, width: int) -> None:
+        if height == width or self._warned:
+            return
+        self._warned = True
+        ratio = max(height, width) / min(height, width)
+        warnings.warn(
+            f"{self.source} returned pictures of {height} x {width}, which are squeezed to a "
+            f"square; this distorts shapes by a factor of {ratio:.2f}. Pass crop=True to pixels() "
+            "to cut out the middle square instead, or let the environment draw squares",
+            stacklevel=5,
+        )
 
     def _colour(self, array: np.ndarray) -> np.ndarray:
         """The same picture with three channels, which come last."""
@@ -75,6 +97,15 @@ class PictureReader:
         if self._scale is None and high > 0:
             self._scale = 255.0 if high <= 1 else 1.0
         return self._scale or 1.0
+
+
+def middle_square(picture: np.ndarray) -> np.ndarray:
+    """Cut out the square in the middle: (H, W, 3) -> (S, S, 3) with S = min(H, W), a view."""
+    height, width = picture.shape[:2]
+    side = min(height, width)
+    top = (height - side) // 2
+    left = (width - side) // 2
+    return picture[top : top + side, left : left + side]
 
 
 def shrink(picture: np.ndarray, size: int) -> np.ndarray:

@@ -55,7 +55,7 @@ class Count(gym.Env):
 
     def render(self):
         self.looks += 1
-        return np.full((30, 40, 3), 10 * self.count, np.uint8)
+        return np.full((40, 40, 3), 10 * self.count, np.uint8)
 
 
 def episode_hashes(name, seeds=(3, 4, 3)):

@@ -1,6 +1,7 @@
 """What an environment returns as its picture: converted once, or refused with the culprit named."""
 
 import re
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +12,8 @@ from dm_control import suite
 from gymnasium import spaces
 from wpt_envs.pictures import PictureReader, shrink
 
+# Most pictures here are not square, to tell rows from columns.
+pytestmark = pytest.mark.filterwarnings("ignore:.*squeezed to a square")
 GRAY = np.arange(30, dtype=np.uint8).reshape(5, 6, 1) * 8
 COLOUR = np.concatenate([GRAY, GRAY + 1, GRAY + 2], -1)
 
@@ -83,6 +86,30 @@ def test_shrinking_averages_over_areas():
     assert np.array_equal(shrink(COLOUR[:, :5], 5), COLOUR[:, :5])
 
 
+def test_the_middle_square_is_cut_out_if_asked_for():
+    for picture in (COLOUR, COLOUR / 255, COLOUR.transpose(2, 0, 1)):
+        read_cropped = PictureReader("render() of <Door>", "", crop=True).read(picture)
+        assert np.array_equal(read_cropped, COLOUR[:, :5])  # 5 x 6: the last column is left out
+    high = COLOUR.transpose(1, 0, 2)
+    assert np.array_equal(PictureReader("", "", crop=True).read(high), high[:5])
+    wide = np.zeros((2, 9, 3), np.uint8)
+    wide[:, 3:5] = 255  # columns 3 and 4 are the middle
+    assert (PictureReader("", "", crop=True).read(wide) == 255).all()
+
+
+def test_pictures_that_are_squeezed_are_warned_of_once_and_the_remedy_helps():
+    reader = PictureReader("render() of <Road>", "")
+    with pytest.warns(
+        UserWarning, match=r"<Road> returned pictures of 5 x 20, .*4\.00.* crop=True"
+    ):
+        reader.read(np.zeros((5, 20, 3), np.uint8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reader.read(np.zeros((5, 20, 3), np.uint8))  # the second
+        PictureReader("", "").read(COLOUR[:, :5])  # a square
+        PictureReader("", "", crop=True).read(COLOUR)  # what the warning advises
+
+
 # --------------------------------------------------------------------- an entry of a dictionary
 
 
@@ -119,6 +146,41 @@ def test_an_entry_of_the_observations_is_shown_without_rendering():
     assert env.observation_space == spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert (first == 0).all() and (obs == 20).all() and reward == 2
     assert info["state"]["top"].max() == 2
+
+
+class Road(gym.Env):
+    """Renders a wide picture, black but for the square in its middle."""
+
+    render_mode, metadata = "rgb_array", {"render_modes": ["rgb_array"]}
+    observation_space = spaces.Dict(road=spaces.Box(0, 255, (30, 120, 3), np.uint8))
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return {"road": self.render()}, {}
+
+    def step(self, action):
+        return {"road": self.render()}, 0.0, False, False, {}
+
+    def render(self):
+        picture = np.zeros((30, 120, 3), np.uint8)
+        picture[:, 45:75] = 200
+        return picture
+
+
+@pytest.mark.parametrize("options", [{}, {"image_key": "road"}])
+def test_pixels_squeezes_wide_pictures_or_cuts_the_middle_out(options):
+    squeezed, cropped = (
+        wpt_envs.pixels(Road(), image_size=64, crop=crop, **options) for crop in (False, True)
+    )
+    assert (cropped.reset()[0] == 200).all() and (cropped.step(np.zeros(1, "f4"))[0] == 200).all()
+    columns = squeezed.reset()[0][0, :, 0]
+    assert columns[:24].max() == 0 and columns[24:40].min() == 200 and columns[40:].max() == 0
+
+
+def test_our_renderer_draws_squares_and_takes_no_crop():
+    env = gym.make("InvertedPendulum-v5")
+    with pytest.raises(ValueError, match="rendering='fast' draws squares already: leave crop out"):
+        wpt_envs.pixels(env, rendering="fast", crop=True)
 
 
 def test_an_entry_that_is_not_there_or_no_picture_is_refused_by_name():

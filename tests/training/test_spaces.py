@@ -16,6 +16,8 @@ from gymnasium.wrappers import (
     FrameStackObservation,
     GrayscaleObservation,
     NormalizeObservation,
+    RescaleAction,
+    ResizeObservation,
 )
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -203,6 +205,12 @@ def test_grayscale_and_transparent_images_are_taken_with_a_warning(show, space, 
     assert (image == image[..., :1]).all()
 
 
+def test_images_resized_by_gymnasium_are_taken():
+    pytest.importorskip("cv2", reason="gymnasium's ResizeObservation needs opencv-python")
+    env = Seen(lambda i: i.repeat(2, 0).repeat(2, 1), box(0, 255, (128, 128, 3), np.uint8))
+    assert shown(learnt(ResizeObservation(env, (64, 64)))) == CLOCK
+
+
 @pytest.mark.filterwarnings("ignore:(grayscale|RGBA) observations")
 def test_rendered_pictures_may_be_grayscale_or_transparent():
     number = box(0, 1, (1,))
@@ -210,6 +218,25 @@ def test_rendered_pictures_may_be_grayscale_or_transparent():
         env = Seen(lambda i: number.low, number, render=lambda i, c=channels: i[..., [0] * c])
         assert shown(learnt(AddRenderObservation(env))) == CLOCK
         assert shown(learnt(wpt_envs.pixels(env))) == CLOCK
+
+
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize("shape", [(30, 120), (120, 30)])
+def test_the_line_for_wide_and_high_images_cuts_their_middle_out(shape, first):
+    def show(image):
+        wide = np.zeros((*shape, 3), np.uint8)
+        middle = wide[:, 45:75] if shape[1] > shape[0] else wide[45:75]
+        middle[:] = image[0, 0, 0]
+        return wide.transpose(2, 0, 1) if first else wide
+
+    space = box(0, 255, (3, *shape) if first else (*shape, 3), np.uint8)
+    env = Seen(show, space)
+    with pytest.warns(UserWarning, match=r"squeezed to 64 x 64.* factor of 4\.00") as warned:
+        squeezed = learnt(env)
+    assert shown(squeezed) == [0] * 8  # the corner is black
+    (line,) = re.findall(r"`env = (.*?)`", str(warned[0].message))
+    with pytest.warns(UserWarning, match="30 x 30 are resized to 64 x 64"):
+        assert shown(learnt(eval(line, {"gymnasium": gymnasium, "env": env}))) == CLOCK
 
 
 # ------------------------------------------------------------------------------------ actions
@@ -220,6 +247,22 @@ def test_infinite_bounds_are_refused_and_the_line_gives_them_bounds(high):
     (env,) = followed(Seen(action=box(-high, high, (2,), np.float32)), "finite bounds")
     learnt(env)
     assert 0.1 < np.abs(env.unwrapped.taken).max() <= 1
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, ClipAction])
+def test_infinite_bounds_stay_infinite_under_clip_action_and_the_line_mends_that_too(wrap):
+    """ClipAction has nothing to clip to here, and RescaleAction nothing to rescale from.
+
+    Older advice named these two. Clipping is to the bounds of the environment underneath, which are
+    infinite, so that actions would still be unbounded, and gymnasium's RescaleAction refuses them.
+    The line gives the bounds that only the user can know.
+    """
+    infinite = Seen(action=box(-np.inf, np.inf, (2,), np.float32))
+    with pytest.raises(ValueError, match="unbounded"):
+        RescaleAction(infinite, np.float32(-1), np.float32(1))
+    (env,) = followed(wrap(infinite), "finite bounds, .*for example from -1 to 1, by")
+    learnt(env)
+    assert 0.1 < np.abs(infinite.taken).max() <= 1
 
 
 def test_clip_action_hides_bounds_and_leaving_it_out_shows_them():

@@ -42,23 +42,32 @@ def area_weights(old: int, new: int) -> Tensor:
 
 def middle_square(images: np.ndarray) -> np.ndarray:
     """The square in the middle of each image: (N, H, W, 3) -> (N, S, S, 3) with S = min(H, W)."""
-    height, width = images.shape[1:3]
+    rows, columns = middle(*images.shape[1:3])
+    return images[:, rows, columns]
+
+
+def middle(height: int, width: int) -> tuple[slice, slice]:
+    """The rows and columns of the square in the middle of an image."""
     side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    return images[:, top : top + side, left : left + side]
+    top = (height - side) // 2
+    left = (width - side) // 2
+    return slice(top, top + side), slice(left, left + side)
 
 
-def resize_message(height: int, width: int, size: int, crop_option: str = "") -> str:
+def resize_message(
+    height: int, width: int, size: int, crop_option: str = "", cut: str | None = None
+) -> str:
     """The sentence to say when images are resized, with a crop that keeps their proportions.
 
     :param crop_option: how to have the middle cut out, if the caller has an option for it
+    :param cut: the code that cuts the middle out; of channels-last images if None
     """
     if height == width:
         return f"Images of {height} x {width} are resized to {size} x {size}"
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    cut = f"image[..., {top}:{top + side}, {left}:{left + side}, :]"
-    ratio = max(height, width) / side
+    rows, columns = middle(height, width)
+    if cut is None:
+        cut = f"image[..., {rows.start}:{rows.stop}, {columns.start}:{columns.stop}, :]"
+    ratio = max(height, width) / min(height, width)
     return (
         f"Images of {height} x {width} are squeezed to {size} x {size}, which distorts shapes by a "
         f"factor of {ratio:.2f}; to keep the proportions, cut the middle out first: {cut}"

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from wpt_agents.data.images import resize_message
+from wpt_agents.data.images import middle, resize_message
 from wpt_agents.data.trajectory import IMAGE_SIZE
 from wpt_agents.model.observations import CHANNELS, channel_axis
 
@@ -54,7 +54,8 @@ def check_observations(env: VecEnv) -> None:
         warnings.warn(f"{CHANNELS[shape[axis]]} observations, {shape}, are {how}", stacklevel=4)
     height, width = (shape[0], shape[1]) if axis == 2 else (shape[1], shape[2])
     if (height, width) != (IMAGE_SIZE, IMAGE_SIZE):
-        warnings.warn(resize_message(height, width, IMAGE_SIZE), stacklevel=4)
+        cut = _crop(height, width, shape[axis], channels_last=axis == 2)
+        warnings.warn(resize_message(height, width, IMAGE_SIZE, cut=cut), stacklevel=4)
 
 
 def is_image(space: spaces.Space[Any], channels: int | None = None) -> bool:
@@ -148,6 +149,16 @@ def _observe(name: str, formula: str, shape: tuple[int, ...]) -> str:
         f"`env = gymnasium.wrappers.TransformObservation(env, lambda {name}: {formula}, "
         f"gymnasium.spaces.Box(0, 255, {shape}, 'uint8'))` around each single environment"
     )
+
+
+def _crop(height: int, width: int, channels: int, channels_last: bool) -> str:
+    """Return the line of code that cuts out the middle square of observations."""
+    rows, columns = middle(height, width)
+    side = min(height, width)
+    cut = f"{rows.start}:{rows.stop}, {columns.start}:{columns.stop}"
+    if channels_last:
+        return _observe("image", f"image[{cut}]", (side, side, channels))
+    return _observe("image", f"image[:, {cut}]", (channels, side, side))
 
 
 # ------------------------------------------------------------------------------------ actions

@@ -138,11 +138,39 @@ def _side_by_side(envs: list[gym.Env]) -> VecEnv:
 
 
 class OwnObservation(gym.ObservationWrapper):
-    """Copies each observation, as some environments draw the next one into the same array."""
+    """Copies each observation, as some environments draw the next one into the same array.
+
+    It also checks images, as a DummyVecEnv writes whatever comes into its array of bytes: floats in
+    [0, 1] would become black, and a grayscale image would fill all three channels.
+    """
 
     def observation(self, observation: Any) -> Any:
         """Return a copy."""
+        if isinstance(self.observation_space, spaces.Dict):
+            for key, space in self.observation_space.spaces.items():
+                if key in observation:
+                    check_image(observation[key], space, f"The entry {key!r} of an observation")
+        else:
+            check_image(observation, self.observation_space, "An observation")
         return observation.copy() if isinstance(observation, np.ndarray) else deepcopy(observation)
+
+
+def check_image(image: Any, space: spaces.Space[Any], name: str) -> None:
+    """Refuse an image that is not what its space says; other observations are not looked at."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return
+    array = np.asarray(image)
+    if array.shape == space.shape and array.dtype == np.uint8:
+        return
+    whole = np.issubdtype(array.dtype, np.integer)
+    if array.shape != space.shape or not whole or array.min() < 0 or array.max() > 255:
+        numbers = array.size > 0 and np.issubdtype(array.dtype, np.number)
+        values = f" from {array.min():.4g} to {array.max():.4g}" if numbers else ""
+        raise ValueError(
+            f"{name} must be {space.shape} uint8 by the environment's observation_space, and is "
+            f"{array.shape} {array.dtype}{values}; nothing of this episode was stored: correct the "
+            "environment's observation, or its observation_space"
+        )
 
 
 def _owning(env: gym.Env) -> gym.Env:
@@ -151,12 +179,13 @@ def _owning(env: gym.Env) -> gym.Env:
 
 def _own_observations(env: VecEnv) -> None:
     """Let the environments of a DummyVecEnv copy, as it resets before it reports the last image."""
-    inner = _innermost(env)
+    inner = innermost(env)
     if isinstance(inner, DummyVecEnv):
         inner.envs = [_owning(each) for each in inner.envs]
 
 
-def _innermost(env: VecEnv | None) -> VecEnv | None:
+def innermost(env: VecEnv | None) -> VecEnv | None:
+    """Return the VecEnv inside of all wrappers."""
     while isinstance(env, VecEnvWrapper):
         env = env.venv
     return env
@@ -209,7 +238,7 @@ def last_observation(
             "observation: a VecEnv puts it into infos[i]['terminal_observation'] before it resets, "
             "as DummyVecEnv of Stable-Baselines3 does"
         )
-    if not isinstance(_innermost(env), DummyVecEnv) and np.array_equal(last, first):
+    if not isinstance(innermost(env), DummyVecEnv) and np.array_equal(last, first):
         warnings.warn(
             f"Environment {i} showed the same image at the end of an episode and at the start of "
             "the next. If it draws all images into one array, the last image is lost: let it "

@@ -1,17 +1,23 @@
 """Collecting: the open episodes of several environments, and who decides on the actions."""
 
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import State, stack_frames, to_images
-from wpt_agents.training.environments import last_observation
+from wpt_agents.training.environments import innermost, last_observation
 
+PATIENCE = 1800.0  # seconds that a worker process may take for a step; people may reset robots
+GO_ON = (
+    "The model is intact: call set_env() with a new environment, then "
+    "learn(..., reset_num_timesteps=False)"
+)
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
@@ -135,7 +141,8 @@ def step_all(
     """Step every environment once.
 
     :param meanwhile: called while worker processes step
-    :raises RuntimeError: a worker process died; what was learned and recorded is kept
+    :raises RuntimeError: a worker process died, or did not answer for `PATIENCE` seconds; what was
+        learned and recorded is kept
     """
     try:
         env.step_async(action)
@@ -143,14 +150,38 @@ def step_all(
             if meanwhile is not None:
                 meanwhile()
         finally:  # an answer left in the pipe would be taken for that of the next step
+            wait_for_workers(env)
             outcome = env.step_wait()
         return outcome
     except (EOFError, ConnectionError) as error:  # SubprocVecEnv's pipes say no more than this
         raise RuntimeError(
             "A worker process of the vector environment died; if it left an error message, it is "
-            "printed above. The model is intact: call set_env() with a new environment, then "
-            "learn(..., reset_num_timesteps=False)"
+            f"printed above. {GO_ON}"
         ) from error
+
+
+def wait_for_workers(env: VecEnv) -> None:
+    """Wait until every worker process of a SubprocVecEnv has answered; end all if one does not.
+
+    :raises RuntimeError: a worker that did not answer for `PATIENCE` seconds
+    """
+    workers = innermost(env)
+    if not isinstance(workers, SubprocVecEnv):
+        return
+    end = time.monotonic() + PATIENCE
+    for i, remote in enumerate(workers.remotes):
+        if not remote.poll(max(0.0, end - time.monotonic())):
+            pid = workers.processes[i].pid
+            for process in workers.processes:
+                process.kill()
+                process.join()
+            for pipe in workers.remotes:
+                pipe.close()
+            workers.closed = True  # there is nobody left to whom `close` could speak
+            raise RuntimeError(
+                f"Environment {i} of the vector environment, in process {pid}, did not answer for "
+                f"{PATIENCE:g} seconds, so that all of its processes were ended. {GO_ON}"
+            )
 
 
 def last_images(

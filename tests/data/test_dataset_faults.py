@@ -1,40 +1,28 @@
 """What the dataset promises when processes die, disks fill up and bytes change: a test each."""
 
-import ctypes
 import errno
 import os
 import random
 import signal
-from contextlib import contextmanager
-from itertools import count
-from multiprocessing import get_context
-from unittest import mock
 
 import numpy as np
 import pytest
 from chain import chain, check_chain, tensors
+from faults import (
+    done,
+    failing,
+    kill_oneself,
+    mount,
+    mounts_of_its_own,
+    no_space,
+    small_disk,
+    started,
+)
 
 from wpt_agents.data import shards
 from wpt_agents.data.dataset import TrajectoryDataset
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-NO_MOUNTS = 77
-
-
-def started(work, *args):
-    """A process forked off, which needs no import of its own."""
-    process = get_context("fork").Process(target=work, args=args, daemon=True)
-    process.start()
-    return process
-
-
-def done(*processes):
-    for process in processes:
-        process.join(60)
-    codes = [process.exitcode for process in processes]
-    if NO_MOUNTS in codes:
-        pytest.skip("this system lets a test mount nothing, not even for itself")
-    assert codes == [0] * len(codes)
 
 
 def empty(path):
@@ -44,34 +32,6 @@ def empty(path):
 
 def content(path):
     return {file.name: file.read_bytes() for file in path.iterdir() if file.stat().st_size}
-
-
-@contextmanager
-def failing(call, fault, rng):
-    """Lets `fault` happen at writing system call number `call` and after; a write does a part."""
-    write, fsync, calls = os.write, os.fsync, count()
-
-    def failing_write(descriptor, data):
-        if next(calls) >= call:
-            write(descriptor, data[: rng.randrange(len(data) + 1)])
-            fault()
-        return write(descriptor, data)
-
-    def failing_fsync(descriptor):
-        if next(calls) >= call:
-            fault()
-        fsync(descriptor)
-
-    with mock.patch("os.write", failing_write), mock.patch("os.fsync", failing_fsync):
-        yield
-
-
-def kill_oneself():
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def no_space():
-    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.fixture
@@ -155,26 +115,8 @@ def test_a_disk_that_fills_up_while_another_dataset_is_copied_is_not_called_dama
     assert TrajectoryDataset.open(tmp_path / "2").validate() == []
 
 
-def mount(source, target, kind, flags, data=None):
-    if ctypes.CDLL(None, use_errno=True).mount(source, target, kind, flags, data):
-        os._exit(NO_MOUNTS)
-
-
-def mounts_of_its_own():
-    """Puts this process where what it mounts is seen by nobody else; root may, others often."""
-    new_mounts, new_user, private = 0x20000, 0x10000000, 0x4000 | 0x40000
-    uid, libc = os.getuid(), ctypes.CDLL(None, use_errno=True)
-    if not hasattr(libc, "unshare") or libc.unshare(new_mounts | (new_user if uid else 0)):
-        os._exit(NO_MOUNTS)
-    if uid:
-        with open("/proc/self/uid_map", "w") as file:
-            file.write(f"{uid} {uid} 1")
-    mount(None, b"/", None, private)
-
-
 def fill_a_small_disk(path):
-    mounts_of_its_own()
-    mount(b"tmpfs", os.fsencode(path), b"tmpfs", 0, b"size=256k")
+    small_disk(path, b"256k")
     ballast = path / "ballast"
     ballast.write_bytes(bytes(128 * 1024))
     with TrajectoryDataset.create(path / "data", image_size=8, codec="raw") as dataset:

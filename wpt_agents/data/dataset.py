@@ -207,10 +207,9 @@ class TrajectoryDataset(StoredTrajectories):
     def _copy_to(self, other: "TrajectoryDataset") -> None:
         writer = other._begin()
         for i, entry in enumerate(list(self._entries)):
-            try:
-                blocks = list(read_blocks(self._folder(i).path, entry, 0, len(entry.sizes) - 1))
-            except OSError as error:
-                raise self._damaged(i, error) from error
+            blocks = self._attempt(
+                i, lambda folder, e: list(read_blocks(folder.path, e, 0, len(e.sizes) - 1))
+            )
             other._entries.append(writer.copy(blocks, entry))
             other._windows = None
 

@@ -23,6 +23,10 @@ class Folder(NamedTuple):
     path: Path
     meta: Meta
 
+    def is_there(self) -> bool:
+        """Whether the folder can be reached; one on a disk that is not mounted cannot."""
+        return (self.path / "meta.json").is_file()
+
     def read(self, entry: Entry, start: int, stop: int) -> tuple[Trajectory, int, int]:
         """Read the blocks that hold images `start` .. `stop - 1`.
 

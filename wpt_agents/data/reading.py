@@ -1,8 +1,9 @@
 """Stored trajectories as a reader sees them: by number, by sequence, or by batch."""
 
 import hashlib
-from collections.abc import Generator, Iterator, Sequence
-from typing import Self
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from wpt_agents.data.index import Entry
 from wpt_agents.data.threads import Threads, prefetched
 from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.data.windows import Piece, Windows, make_batch
+
+T = TypeVar("T")
+PAUSES = (1.0, 4.0, 15.0)  # seconds between attempts to read a folder that has disappeared
 
 
 class StoredTrajectories:
@@ -212,10 +216,32 @@ class StoredTrajectories:
     def _read(self, piece: Piece) -> tuple[Trajectory, int, int]:
         """Read the blocks that a piece lies in, as a trajectory, and the piece's place therein."""
         i, start, stop = piece
-        try:
-            return self._folder(i).read(self._entries[i], start, stop)
-        except OSError as error:
-            raise self._damaged(i, error) from error
+        return self._attempt(i, lambda folder, entry: folder.read(entry, start, stop))
+
+    def _attempt(self, i: int, read: Callable[[Folder, Entry], T]) -> T:
+        """Read from trajectory `i`, several times if its folder has disappeared.
+
+        :raises ValueError: the trajectory is damaged
+        :raises FileNotFoundError: the folder has disappeared and does not come back
+        """
+        folder = self._folder(i)
+        for pause in (*PAUSES, None):
+            try:
+                return read(folder, self._entries[i])
+            except OSError as error:
+                if folder.is_there():
+                    raise self._damaged(i, error) from error
+                if pause is None:
+                    raise self._gone(folder, error) from error
+                time.sleep(pause)
+        raise AssertionError  # the last attempt returns or raises
+
+    def _gone(self, folder: Folder, error: OSError) -> OSError:
+        return FileNotFoundError(
+            f"The dataset {folder.path} cannot be reached any more ({error}), also not after "
+            f"{sum(PAUSES):g} seconds: bring it back, for example by mounting its disk, and start "
+            "again; what was saved before continues from there"
+        )
 
     def _damaged(self, i: int, error: OSError) -> ValueError:
         return ValueError(

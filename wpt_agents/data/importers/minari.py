@@ -2,6 +2,8 @@
 
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,8 @@ class MinariEpisodes(Episodes):
             folder = Path(name)
             if folder.exists():
                 inner = folder / "data"
-                self._data = minari.MinariDataset(inner if inner.exists() else folder)
+                with _named(str(folder)):
+                    self._data = minari.MinariDataset(inner if inner.exists() else folder)
             else:
                 self._data = minari.load_dataset(str(name))
         else:
@@ -50,7 +53,8 @@ class MinariEpisodes(Episodes):
         return int(self._data.total_episodes)
 
     def __getitem__(self, i: int) -> Trajectory:
-        episode = self._data[i]
+        with _named(f"Episode {i} of {self._name}"):
+            episode = self._data[i]
         source = f"{self._name} episode {episode.id}"
         parts = [self._actions(key, episode.actions) for key in self.action_keys or ("",)]
         action, low, high = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
@@ -88,6 +92,17 @@ class MinariEpisodes(Episodes):
                 f"{self._name} has several of them; give {option}, one of: {', '.join(tree)}"
             )
         return np.asarray(tree)
+
+
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    """Name what is damaged, which the errors of HDF5 and Arrow do not."""
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError) as error:
+        raise ValueError(
+            f"{what} is damaged ({error}): download or record this Minari dataset again"
+        ) from error
 
 
 def _parts(key: str | None) -> list[str]:

@@ -348,6 +348,20 @@ def test_evaluating_in_the_middle_of_rollouts_changes_nothing(tmp_path, determin
     assert WPT.load(tmp_path / "best_model").policy.action_space.shape == (2,)
 
 
+def test_evaluating_after_every_step_changes_nothing():
+    plain = agent(ClockEnv()).learn(35)
+    model = agent(ClockEnv())
+    callback = EvalCallback(Monitor(ClockEnv()), n_eval_episodes=1, eval_freq=1, verbose=0)
+    model.learn(35, callback=callback)
+    assert callback.n_calls == 35 and callback.last_mean_reward == 28
+    assert same(weights(model), weights(plain)) and model.updates == plain.updates > 0
+    for one, other in zip(
+        model.replay_buffer.trajectories, plain.replay_buffer.trajectories, strict=True
+    ):
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_array_equal(one.action, other.action)
+
+
 def test_evaluating_several_environments_changes_nothing_in_several(tmp_path):
     plain = agent(clocks(3)).learn(42)
     env = DummyVecEnv([lambda: Monitor(ClockEnv())] * 2)

@@ -233,6 +233,26 @@ def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network
     assert finite(loaded)
 
 
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [("world_model.encoder", "world model"), ("actor", "actor"), ("critic", "critic")],
+)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_gradient_that_is_not_finite_stops_though_the_loss_is(network, name, value):
+    model = agent(ClockEnv()).learn(28)
+    before = weights(model)
+    updates = model.updates
+    parameter = next(model.policy.get_submodule(network).parameters())
+    hook = parameter.register_hook(lambda gradient: torch.full_like(gradient, value))
+    with pytest.raises(FloatingPointError, match=rf"The {name} loss is -?\d.*, its gradient norm"):
+        model.learn(100, reset_num_timesteps=False)
+    assert finite(model) and model.updates == updates
+    of_it = weights(model, network)
+    assert all((of_it[key] == before[key]).all() for key in of_it)  # no step was taken
+    hook.remove()
+    assert finite(model.learn(28, reset_num_timesteps=False))
+
+
 def test_a_clone_whose_loss_is_nan_stops_with_finite_weights(monkeypatch):
     model = pretrained([recorded()], env=DotEnv())
     poison(monkeypatch, "bc_loss", after=1, module=cloning)

@@ -3,8 +3,10 @@
 Such a file is a zip without compression; each member carries a checksum that reading verifies.
 """
 
+import glob
 import json
 import os
+import socket
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -21,21 +23,41 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which replaces `path` if the block succeeds.
 
     The file is on the disk (fsync) before it is renamed, so a crash at any moment leaves one of the
-    two whole. A block that raises leaves `path` as it was and nothing beside it.
+    two whole. A block that raises leaves `path` as it was and nothing beside it. What a killed
+    process left is removed by the next one that writes to `path` on the same machine.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    here = f".{path.name}.tmp-{socket.gethostname()}-"
+    for left in path.parent.glob(f"{glob.escape(here)}*"):
+        if not _alive(left.name.removeprefix(here)):
+            left.unlink(missing_ok=True)
+    temporary = path.with_name(f"{here}{os.getpid()}")
     try:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(FileNotFoundError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename is None:  # as when the disk is full
+            error.filename = str(path)
         raise
     sync_folder(path.parent)
+
+
+def _alive(pid: str) -> bool:
+    """Return whether a process of this machine has this number, as far as that can be known."""
+    if os.name == "nt":  # where the signal 0 is Ctrl-C
+        return True
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, ValueError):  # somebody else's process, or a file that is not ours
+        return True
+    return True
 
 
 def sync_folder(folder: Path) -> None:

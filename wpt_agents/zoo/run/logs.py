@@ -1,5 +1,6 @@
 """SB3's logs and evaluations, continued when a run resumes."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,21 @@ class Evaluations(EvalCallback):
         if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
             done = len(self.evaluations_timesteps) * (self.n_eval_episodes + 1)
             go_to_episode(self.eval_env, done)
+            return self._evaluated()
         return super()._on_step()
+
+    def _evaluated(self) -> bool:
+        """Evaluate and replace `evaluations.npz` whole; SB3 would write into it in place."""
+        assert self.log_path is not None
+        path = Path(f"{self.log_path}.npz")
+        aside = path.with_name(f".{path.name}")
+        self.log_path = str(aside.with_suffix(""))
+        try:
+            go_on = super()._on_step()
+        finally:
+            self.log_path = str(path.with_suffix(""))
+        os.replace(aside, path)
+        return go_on
 
 
 def go_to_episode(venv: VecEnv, number: int) -> None:

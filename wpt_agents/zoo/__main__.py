@@ -1,8 +1,12 @@
 """`python -m wpt_agents.zoo`; the commands are in `wpt_agents.zoo.commands`."""
 
+import os
 import sys
 
 if __name__ == "__main__":
+    # Threads that wait by sleeping leave the core to others. OpenMP reads this when torch is
+    # loaded, here and in the processes that the zoo starts.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         from wpt_agents.zoo.commands.app import main
     except ModuleNotFoundError as error:

@@ -1,11 +1,15 @@
 """What this machine has of what a command asks for: an engine's package, a GPU."""
 
 import importlib
+import os
+from collections.abc import Mapping
 from types import ModuleType
+from typing import Any
 
 import torch
 
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.sizes import SIZES, Size, find_size
 
 ENGINES = {"none": "", "local": "", "ray": "ray", "slurm": "submitit"}  # and their packages
 
@@ -39,3 +43,14 @@ def check_device(device: str) -> None:
             f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
             "GPUs here; take --device cpu, or a build of torch with CUDA and a driver"
         )
+
+
+def choose_threads(size: str | Size | Mapping[str, Any]) -> None:
+    """Let torch compute networks narrower than those of `small` on one thread.
+
+    They gain little by a second one, and threads that wait for each other keep a core busy, so that
+    they halve the speed where another process needs it (docs/speed.md). Wider networks use all
+    cores, as torch does by default. OMP_NUM_THREADS overrides this choice.
+    """
+    if "OMP_NUM_THREADS" not in os.environ and find_size(size).units < SIZES["small"].units:
+        torch.set_num_threads(1)

@@ -18,7 +18,8 @@ from wpt_agents.zoo.commands.options import print_table
 
 Case = StrEnum(
     "Case",
-    "model scaling profile work policy replay data envs retrieval prediction exploration all",
+    "model scaling profile work policy replay data envs retrieval prediction exploration threads "
+    "all",
 )
 Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])

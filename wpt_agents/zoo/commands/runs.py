@@ -111,7 +111,7 @@ def pretrain_model(
     On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
     from wpt_agents.training.distributed import joined, local_device
-    from wpt_agents.zoo.machine import check_device
+    from wpt_agents.zoo.machine import check_device, choose_threads
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.shared import Shared
     from wpt_agents.zoo.run.shared import collect_data, pretrain
@@ -119,6 +119,7 @@ def pretrain_model(
 
     check_device(device)
     chosen = load_preset(suite, preset, settings)
+    choose_threads(chosen.wpt.get("size", "paper"))
     shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
     with joined(local_device(device)) as world:
         console.quiet = world.rank > 0

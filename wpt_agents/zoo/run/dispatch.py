@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import typer
 
-from wpt_agents.zoo.machine import check_machine
+from wpt_agents.zoo.machine import check_machine, choose_threads
 from wpt_agents.zoo.plan.estimate import check_space, summary
 from wpt_agents.zoo.plan.overview import show_plan
 from wpt_agents.zoo.plan.runs import Run
@@ -35,5 +35,6 @@ def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources)
     """
     check_plan(runs, engine, force)
     if engine == "none":
+        choose_threads(runs[0].preset.wpt.get("size", "paper"))
         return run_all(runs, force)
     return run_on(engine, runs, force, resources)

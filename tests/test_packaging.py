@@ -105,3 +105,50 @@ def test_the_readmes_example_runs_from_the_wheel(installed, tmp_path):
     (tmp_path / "example.py").write_text(code)
     ran = outside(installed, tmp_path, "example.py")
     assert ran.returncode == 0 and re.search(r"return \d+", ran.stdout), ran.stderr[-2000:]
+
+
+NEWER = "mujoco>=3.3.3,<4"  # than 3.3.0, which metaworld, in the extra `sims`, pins
+BESIDE = """
+import sys
+import gymnasium, mujoco, numpy
+import wpt_envs
+from wpt_agents import Trajectory, WPT
+assert mujoco.__file__.startswith(sys.argv[1]), mujoco.__file__
+assert tuple(map(int, mujoco.__version__.split(".")[:3])) > (3, 3, 0), mujoco.__version__
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=20)
+env = wpt_envs.pixels(env, rendering="fast")
+images, actions = [env.reset(seed=0)[0]], []
+for _ in range(12):
+    actions.append(env.action_space.sample() / 3)
+    images.append(env.step(3 * actions[-1])[0])
+data = [Trajectory(numpy.stack(images), numpy.stack(actions))]
+small = {"size": "debug", "batch_size": 2, "batch_length": 8, "max_action_dim": 1, "seed": 0}
+model = WPT.pretrain(data, steps=1, num_retrieve=1, bc_steps=1, **small)
+model.set_env(env)
+model.learn(20)
+print("learnt beside", mujoco.__version__, images[0].std() > 3)
+"""
+
+
+def pip(*words):
+    command = [sys.executable, "-m", "pip", "install", "-q", *words]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+@pytest.mark.nightly
+def test_the_plain_wheel_works_beside_a_newer_mujoco_and_only_the_simulators_pin_one(
+    built, installed, tmp_path
+):
+    (wheel,) = built.glob("*.whl")
+    fetched = pip("--no-deps", "--target", str(tmp_path / "newer"), NEWER)
+    if fetched.returncode:
+        pytest.skip(f"pip finds no newer mujoco here: {fetched.stderr.strip().splitlines()[-1]}")
+    (tmp_path / "newer").rename(installed / "newer")
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (installed / "newer", installed)))}
+    command = [sys.executable, "-P", "-c", BESIDE, str(installed / "newer")]
+    ran = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert re.search(r"learnt beside 3\.\d+\.\d+ True", ran.stdout), ran.stdout + ran.stderr
+    plain = pip("--dry-run", str(wheel), NEWER)
+    assert plain.returncode == 0, plain.stderr
+    simulators = pip("--dry-run", f"{wheel}[sims]", NEWER)  # the resolver does look at the pins
+    assert simulators.returncode != 0 and "mujoco" in simulators.stderr

@@ -75,6 +75,10 @@ def assert_equal(seen, after, expected, expected_after, rtol=1e-4):
     assert seen.keys() <= expected.keys() and seen
     for step, told in seen.items():
         assert told == pytest.approx(expected[step], rel=rtol), step
+    assert_close(after, expected_after, rtol)
+
+
+def assert_close(after, expected_after, rtol=1e-4):
     for name, weight in after.items():
         # Adam's first steps divide by the gradient itself: where that is nearly zero, rounding
         # moves a weight by up to the learning rate, 1e-3; hardly any is
@@ -210,6 +214,24 @@ def test_processes_connect_again_after_they_parted_and_after_one_was_restarted()
         for meeting in range(2):
             assert f"rank {rank}, attempt 1, meeting {meeting}" in said
     assert "rank 1, attempt 0, meeting 1" not in said
+
+
+@pytest.mark.slow
+def test_a_sigterm_to_one_process_stops_all_and_torchrun_goes_on_to_the_same_model(
+    folder, tmp_path
+):
+    script = Path(__file__).parents[1] / "helpers" / "terminated.py"
+    torchrun("--max-restarts=1", script, folder / "data", tmp_path)
+    # all stopped, at an update of which both have the weights, and no earlier than the last
+    # checkpoint; rank 0 had not finished
+    (attempt,) = tmp_path.glob("attempt-*.json")
+    assert attempt.name == "attempt-1.json"
+    updates = json.loads(attempt.read_text())
+    assert updates[0] in (5, 6) and updates[-1] == 6
+    model, _ = train(folder / "data")
+    about, tensors = read_model(tmp_path / "model.zip")
+    assert about["counters"]["pretrain_steps"] == 6
+    assert_close(tensors["policy"], weights(model))
 
 
 @pytest.mark.slow

@@ -1,0 +1,86 @@
+"""Files that other programs read during a run are whole at every moment."""
+
+import shutil
+from itertools import count
+
+import numpy as np
+import pytest
+from debug_agent import ClockEnv, agent
+from faults import kill_at_change, killed
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from wpt_agents.zoo.judge.evaluation import EpisodeSeeds
+from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
+from wpt_agents.zoo.run.logs import Evaluations
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+
+
+def evaluating(folder, steps):
+    """Learns for some steps, with an evaluation of one episode after every seventh."""
+    venv = DummyVecEnv([lambda: EpisodeSeeds(Monitor(ClockEnv()))])
+    callback = Evaluations(venv, n_eval_episodes=1, eval_freq=7, log_path=str(folder), verbose=0)
+    agent(ClockEnv()).learn(steps, callback=callback)
+
+
+def evaluations(folder):
+    with np.load(folder / "evaluations.npz") as arrays:
+        assert len(arrays["results"]) == len(arrays["timesteps"])
+        return arrays["timesteps"].tolist()
+
+
+def test_the_evaluations_are_whole_while_new_ones_are_written(tmp_path, monkeypatch):
+    seen, savez = [], np.savez
+
+    def write_and_look(path, **arrays):
+        savez(path, **arrays)
+        there = (tmp_path / "evaluations.npz").exists()
+        seen.append(evaluations(tmp_path) if there else None)
+
+    monkeypatch.setattr(np, "savez", write_and_look)
+    evaluating(tmp_path, 21)
+    assert seen == [None, [7], [7, 14]]  # a reader finds the earlier ones until the new are whole
+    assert evaluations(tmp_path) == [7, 14, 21]
+    assert [path.name for path in tmp_path.iterdir()] == ["evaluations.npz"]
+
+
+def evaluate_until_killed(folder, number):
+    kill_at_change(number)
+    evaluating(folder, 14)
+
+
+@pytest.mark.slow
+def test_killed_at_any_write_the_evaluations_are_whole(tmp_path):
+    found = set()
+    for number in count():
+        folder = tmp_path / "run"
+        folder.mkdir()
+        over = not killed(evaluate_until_killed, folder, number)
+        there = (folder / "evaluations.npz").exists()
+        found.add(tuple(evaluations(folder)) if there else None)
+        shutil.rmtree(folder)
+        if over:
+            break
+    assert found == {None, (7,), (7, 14)}
+
+
+def write_results_until_killed(folder, number):
+    kill_at_change(number)
+    write_result(folder, result(2.0))
+
+
+def result(value):
+    scores = {"last": Score((value, value), ())}
+    return Result("dmc", "dot", "wpt", Variant.parse("toy"), 0, 75, 75, "return", scores)
+
+
+def test_killed_at_any_write_a_result_is_that_before_or_after(tmp_path):
+    found = set()
+    for number in count():
+        write_result(tmp_path, result(1.0))
+        over = not killed(write_results_until_killed, tmp_path, number)
+        found.add(read_result(tmp_path).scores["last"].returns)
+        if over:
+            break
+    assert found == {(1.0, 1.0), (2.0, 2.0)} and number > 2

@@ -1,5 +1,6 @@
 """Several processes and one foreign file; systems with another encoding, or without locks."""
 
+import ast
 import os
 import signal
 import subprocess
@@ -100,12 +101,22 @@ def test_labels_in_any_script_are_read_where_the_locale_is_ascii(tmp_path):
     assert told.stdout.strip() == ascii(task)
 
 
-@pytest.mark.parametrize("folder", ["data", "files"])
-def test_every_text_file_is_opened_with_an_encoding(folder):
-    for path in (ROOT / "wpt_agents" / folder).rglob("*.py"):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if ".read_text(" in line or ".write_text(" in line:
-                assert "encoding=" in line, f"{path}:{number}"
+def opens_text(call):
+    """Whether a call opens a text file: read_text, write_text, or open with no "b" in its mode."""
+    name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+    if name != "open" or isinstance(call.func, ast.Attribute):
+        return name in ("read_text", "write_text")
+    modes = [a.value for a in call.args[1:2] if isinstance(a, ast.Constant)]
+    return "b" not in (modes or ["r"])[0]
+
+
+@pytest.mark.parametrize("package", ["wpt_agents", "envs"])
+def test_every_text_file_is_opened_with_an_encoding(package):
+    for path in (ROOT / package).rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(call, ast.Call) and opens_text(call):
+                keywords = [keyword.arg for keyword in call.keywords]
+                assert "encoding" in keywords, f"{path}:{call.lineno}"
 
 
 def test_without_locks_a_dataset_is_read_and_not_written(tmp_path, monkeypatch):

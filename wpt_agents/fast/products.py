@@ -24,7 +24,7 @@ IMAGES = 16  # torch passes a convolution of fewer images to MKL, too
 def cpu_model() -> str:
     """Return what the system says of the processor, including its maker."""
     info = Path("/proc/cpuinfo")
-    return info.read_text() if info.exists() else platform.processor()
+    return info.read_text(encoding="utf-8") if info.exists() else platform.processor()
 
 
 AMD_AVX512 = (

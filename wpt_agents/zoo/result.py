@@ -208,7 +208,7 @@ def read_result(folder: Path) -> Result | None:
     if not path.exists():
         return None
     try:
-        return _from_json(json.loads(path.read_text()))
+        return _from_json(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
 
@@ -216,18 +216,18 @@ def read_result(folder: Path) -> Result | None:
 def write_result(folder: Path, result: Result) -> None:
     """Write the result of the run in `folder`, as a whole or not at all."""
     with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(_to_json(result), indent=1))
+        temporary.write_text(json.dumps(_to_json(result), indent=1), encoding="utf-8")
 
 
 def read_score(path: Path) -> Score | None:
     """Read the score in a file of its own, None if there is no such file."""
-    return _score(json.loads(path.read_text())) if path.exists() else None
+    return _score(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
 
 def write_score(path: Path, score: Score) -> None:
     """Write one score to a file of its own, as a whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_score_json(score), indent=1))
+        temporary.write_text(json.dumps(_score_json(score), indent=1), encoding="utf-8")
 
 
 def _to_json(result: Result) -> dict[str, Any]:

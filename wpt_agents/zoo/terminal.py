@@ -31,7 +31,7 @@ def logged(path: Path) -> Iterator[None]:
     """Append everything that is printed to a file, progress bars included."""
     path.parent.mkdir(parents=True, exist_ok=True)
     streams = sys.stdout, sys.stderr
-    with open(path, "a", buffering=1) as file:
+    with open(path, "a", buffering=1, encoding="utf-8") as file:
         sys.stdout = sys.stderr = file
         console.file = file
         try:

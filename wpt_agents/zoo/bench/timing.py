@@ -126,7 +126,7 @@ def forget_peak() -> None:
     with suppress(OSError, AttributeError, TypeError):  # where there is no glibc
         ctypes.CDLL(None).malloc_trim(0)  # what was freed and kept goes back to the system
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def memory_mib(field: str) -> float:
@@ -134,5 +134,5 @@ def memory_mib(field: str) -> float:
     status = Path("/proc/self/status")
     if not status.exists():
         return float("nan")
-    lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
+    lines = dict(line.split(":", 1) for line in status.read_text(encoding="utf-8").splitlines())
     return int(lines[field].split()[0]) / 1024

@@ -225,7 +225,7 @@ def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
     dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
         with replacing(label) as temporary:
-            temporary.write_text(json.dumps(told, indent=1))
+            temporary.write_text(json.dumps(told, indent=1), encoding="utf-8")
     found = _read_label(label) if label.exists() else {}
     differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]
     if differ:
@@ -238,7 +238,7 @@ def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
 
 def _read_label(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text())
+        return json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(
             f"{file} is damaged ({error}); restore the file, or give another path"

@@ -58,7 +58,7 @@ def report(
     as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
     if record is not None:
         lines = records.update(record, records.lines_of(find_finished(folder)))
-        record.with_suffix(".md").write_text(record_tables.markdown(lines))
+        record.with_suffix(".md").write_text(record_tables.markdown(lines), encoding="utf-8")
         record_tables.draw(record.with_suffix(".png"), lines)
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
@@ -67,7 +67,7 @@ def report(
     else:
         page = (out or folder / "report") / "index.html"
         write_page(folder, page, media)
-        page.with_name("report.md").write_text(as_markdown)
-        page.with_name("policies.csv").write_text(tables.policy_csv(policies))
+        page.with_name("report.md").write_text(as_markdown, encoding="utf-8")
+        page.with_name("policies.csv").write_text(tables.policy_csv(policies), encoding="utf-8")
         console.print(tables.summary_table(rows))
         console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")

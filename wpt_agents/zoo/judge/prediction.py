@@ -201,7 +201,7 @@ def strip(title: str, tests: Sequence[Batch], ways: Mapping[str, Predict]) -> St
 
 def write_curves(path: Path, curves: Sequence[Curve]) -> None:
     """Writes every horizon's error and interval."""
-    with open(path, "w", newline="") as file:
+    with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(("robot", "prediction", "horizon", "error", "low", "high"))
         for c in curves:

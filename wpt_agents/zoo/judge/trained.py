@@ -109,7 +109,7 @@ def read_origin(folder: Path) -> Origin | None:
     if not path.exists():
         return None
     try:
-        config = SimpleNamespace(**yaml.safe_load(path.read_text()))
+        config = SimpleNamespace(**yaml.safe_load(path.read_text(encoding="utf-8")))
         env = EnvSettings.of("env", config.env)
         return Origin(config.task, asdict(env), getattr(config, "method", "wpt"))
     except (yaml.YAMLError, AttributeError, TypeError) as error:

@@ -228,7 +228,7 @@ def _read_suite(suite: str) -> SuiteFile:
         raise unknown_name("suite with presets", suite, suite_names())
     path = preset_folder() / f"{suite}.yaml"
     try:
-        content = read_yaml(path.read_text())
+        content = read_yaml(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is not valid YAML: {error}") from None
     if not isinstance(content, dict) or set(content) != {"default", "presets"}:

@@ -73,7 +73,7 @@ def references() -> tuple[Reference, ...]:
     folder = preset_folder() / "references"
     for path in (*sorted(folder.glob("table*.csv")), folder / "official.csv"):
         table = 5 if path.stem == "official" else int(path.stem[-1])
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             rows = [SimpleNamespace(**row) for row in csv.DictReader(file)]
         for row in rows:
             score = float(row.score) if row.score else None

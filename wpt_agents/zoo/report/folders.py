@@ -26,7 +26,7 @@ class Finished:
     def text(self, name: str) -> str:
         """Return the content of a text file of the folder, empty if there is no such file."""
         path = self.folder / name
-        return path.read_text(errors="replace").strip() if path.exists() else ""
+        return path.read_text(encoding="utf-8", errors="replace").strip() if path.exists() else ""
 
     @property
     def name(self) -> str:
@@ -107,5 +107,7 @@ def find_unfinished(folder: Path) -> list[Unfinished]:
     for path in sorted(folder.glob("**/config.yaml")):
         if not (path.parent / FILE).exists():
             error = path.parent / "error.txt"
-            entries.append(Unfinished(path.parent, error.read_text() if error.exists() else ""))
+            entries.append(
+                Unfinished(path.parent, error.read_text(encoding="utf-8") if error.exists() else "")
+            )
     return entries

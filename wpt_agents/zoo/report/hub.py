@@ -37,12 +37,14 @@ def push(folder: Path, name: str, private: bool = False) -> str:
         for file in FILES:
             if (folder / file).exists():
                 shutil.copy2(folder / file, Path(aside) / file)
-        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
         config.pop("data", None)  # in older runs a path on their machine
-        (Path(aside) / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+        (Path(aside) / "config.yaml").write_text(
+            yaml.safe_dump(config, sort_keys=False), encoding="utf-8"
+        )
         if (folder / "policy.mp4").exists():
             shutil.copy2(folder / "policy.mp4", Path(aside) / VIDEO)
-        (Path(aside) / "README.md").write_text(card(result, name))
+        (Path(aside) / "README.md").write_text(card(result, name), encoding="utf-8")
         address = api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(repo_id=name, folder_path=aside, commit_message="Upload a run")
     return str(address)

@@ -30,7 +30,7 @@ def write_page(folder: Path, path: Path, media: str = "first") -> None:
         raise unknown_name("choice of media", media, MEDIA)
     page = render(find_finished(folder), find_unfinished(folder), media)
     with replacing(path) as temporary:
-        temporary.write_text(page)
+        temporary.write_text(page, encoding="utf-8")
 
 
 def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: str = "first") -> str:

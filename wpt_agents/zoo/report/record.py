@@ -117,7 +117,7 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
     names = [field.name for field in fields(Line)]
     writer.writerows([getattr(line, name) for name in names] for line in every)
     with replacing(path) as temporary:
-        temporary.write_text(file.getvalue())
+        temporary.write_text(file.getvalue(), encoding="utf-8")
     return every
 
 
@@ -126,7 +126,7 @@ def read(path: Path) -> list[Line]:
 
     :raises ValueError: a file that is no record, or is damaged
     """
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     try:
         return [_parse(row) for row in rows]

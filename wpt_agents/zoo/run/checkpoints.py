@@ -69,7 +69,7 @@ class Checkpoint:
     @classmethod
     def read(cls, folder: Path) -> Self:
         """Read the state of a checkpoint."""
-        return cls(folder, State(**json.loads((folder / STATE).read_text())))
+        return cls(folder, State(**json.loads((folder / STATE).read_text(encoding="utf-8"))))
 
     @property
     def model(self) -> Path:
@@ -139,7 +139,7 @@ def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: f
         files={path.name: _checksum(path) for path in sorted(aside.iterdir())},
         cpu_seconds=cpu_seconds,
     )
-    (aside / STATE).write_text(json.dumps(asdict(state)))
+    (aside / STATE).write_text(json.dumps(asdict(state)), encoding="utf-8")
     for path in aside.iterdir():
         with open(path, "rb") as file:
             os.fsync(file.fileno())

@@ -169,7 +169,11 @@ def why(job: Run, code: int) -> str:
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
     path = job.folder / "error.txt"
-    return path.read_text().strip().splitlines()[-1] if path.exists() else f"exit code {code}"
+    return (
+        path.read_text(encoding="utf-8").strip().splitlines()[-1]
+        if path.exists()
+        else f"exit code {code}"
+    )
 
 
 class Ray:

@@ -36,7 +36,7 @@ def check_folder(job: Run, force: bool) -> None:
         section = job.algorithm.section
         keywords = {section: dict(defaults(job.algorithm.agent))}
         usual = _flat(Preset().as_dict() | keywords)  # of keys that older versions do not know
-        before = usual | _flat(yaml.safe_load(path.read_text()))
+        before = usual | _flat(yaml.safe_load(path.read_text(encoding="utf-8")))
         now = usual | _flat(json.loads(json.dumps(job.config())))
         differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))
         if differ:

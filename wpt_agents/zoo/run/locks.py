@@ -21,7 +21,7 @@ def locked(path: Path, wait: bool = False) -> Iterator[None]:
     :param wait: until it is free, instead of refusing after `PATIENCE`
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w") as file:
+    with open(path, "w", encoding="utf-8") as file:
         until = time.monotonic() + PATIENCE
         while not _taken(file, wait):
             if time.monotonic() > until:
@@ -44,4 +44,4 @@ def _taken(file: IO[str], wait: bool) -> bool:
 def write_json(path: Path, value: Any) -> None:
     """Writes `value` to `path`, whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1))
+        temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")

@@ -56,7 +56,7 @@ class ContinuedCSV(CSVOutputFormat):
     """SB3's `progress.csv`, which goes on with the rows that are there."""
 
     def __init__(self, path: Path) -> None:
-        before = path.read_text() if path.exists() else ""
+        before = path.read_text(encoding="utf-8") if path.exists() else ""
         super().__init__(str(path))
         self.file.write(before)
         self.file.flush()

@@ -72,13 +72,13 @@ def _begin(job: Run) -> Result:
     """Write into the folder what is being done, then do it."""
     (job.folder / "error.txt").unlink(missing_ok=True)
     with replacing(job.folder / "config.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False))
+        temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False), encoding="utf-8")
     write_json(job.folder / "system.json", system())
-    (job.folder / "command.txt").write_text(job.command + "\n")
+    (job.folder / "command.txt").write_text(job.command + "\n", encoding="utf-8")
     try:
         return do_stages(job)
     except Exception:
-        (job.folder / "error.txt").write_text(traceback.format_exc())
+        (job.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
         raise
 
 

@@ -72,7 +72,9 @@ def _collected(shared: Shared) -> TrajectoryDataset:
 def _warn_of_differences(shared: Shared) -> None:
     """Warn of data that `collect` recorded in another environment than the task's."""
     label = shared.data_path / "collect.json"
-    recorded: dict[str, Any] = json.loads(label.read_text())["env"] if label.exists() else {}
+    recorded: dict[str, Any] = (
+        json.loads(label.read_text(encoding="utf-8"))["env"] if label.exists() else {}
+    )
     for name, value in recorded.items():
         ours = shared.env.get(name, value)
         if ours != value:

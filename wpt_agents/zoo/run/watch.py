@@ -59,7 +59,7 @@ def read_monitor(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lengths, returns and times (seconds) of SB3's Monitor; a last line half written is left."""
     rows = []
     if path.exists():
-        for line in path.read_text().splitlines(keepends=True)[2:]:
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)[2:]:
             cells = line.split(",")
             if line.endswith("\n") and len(cells) >= 3 and cells[0] != "r":
                 rows.append([float(cell) for cell in cells[:3]])
@@ -82,7 +82,7 @@ def is_locked(folder: Path) -> bool:
     path = folder / "lock"
     if not path.exists():
         return False
-    with open(path) as file:
+    with open(path, encoding="utf-8") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:

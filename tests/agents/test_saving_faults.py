@@ -1,6 +1,8 @@
 """Model files under faults: killed writers, full and read-only disks, odd paths, poisoned files."""
 
+import base64
 import errno
+import json
 import os
 import pickle
 import random
@@ -198,18 +200,25 @@ class Trap:
         return os.mkdir, (os.environ["TRAP"],)
 
 
-@pytest.mark.parametrize("member", ["data", "pytorch_variables.pth", "policy.pth"])
+@pytest.mark.parametrize("member", ["data", "policy.pth"])
 def test_a_poisoned_file_of_sb3_is_refused_and_not_run(tmp_path, monkeypatch, member):
     monkeypatch.setenv("TRAP", str(tmp_path / "sprung"))
+    trap = pickle.dumps(Trap())
+    serialized = {":type:": "dict", ":serialized:": base64.b64encode(trap).decode()}
+    poison = {"data": json.dumps({"policy_kwargs": serialized}), "policy.pth": trap}[member]
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save(tmp_path / "sac.zip")
     with zipfile.ZipFile(tmp_path / "sac.zip") as file:
         content = {name: file.read(name) for name in file.namelist()}
     with zipfile.ZipFile(tmp_path / "sac.zip", "w") as file:
-        for name, data in content.items():
-            file.writestr(name, pickle.dumps(Trap()) if name == member else data)
+        for name, data in (content | {member: poison}).items():
+            file.writestr(name, data)
     with pytest.raises(ValueError, match="not a model of wpt_agents"):
         WPT.load(tmp_path / "sac.zip")
     assert not (tmp_path / "sprung").exists()
+    if member == "data":  # which springs where it is loaded by SB3 itself
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            SAC.load(tmp_path / "sac.zip")
+        assert (tmp_path / "sprung").exists()
 
 
 # ------------------------------------------------------------------------------ the same numbers

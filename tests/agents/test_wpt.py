@@ -583,6 +583,57 @@ def test_another_task_begins_with_an_episode_of_its_own():
     assert not model.replay_buffer.trajectories  # 4 + 3 steps would have ended the old one
 
 
+def test_earlier_episodes_are_kept_without_rewards_and_retrieved_for_the_next_task(store, tmp_path):
+    model = pretrained(store, env=DotEnv(), num_retrieve=6, embodiment="dot").learn(2 * LENGTH)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3]
+    episodes = model.replay_buffer.trajectories
+    model.next_task(DotEnv())
+    assert model.num_timesteps == 0 and not model.replay_buffer.trajectories
+    assert len(model.kept.trajectories) == 2
+    assert all(t.reward is None for t in model.kept.trajectories)
+    model.learn(1)
+    assert sorted(model.retrieved_ids) == [0, 1, 2, 3, 6, 7]  # the dataset has six
+    earlier = [number - 6 for number in model.retrieved_ids if number >= 6]
+    for number, trajectory in zip(earlier, model.retrieved.trajectories[4:], strict=True):
+        assert (trajectory.image == episodes[number].image).all() and trajectory.reward is None
+    model.save(tmp_path / "model")
+    loaded = WPT.load(tmp_path / "model", dataset=store, env=DotEnv())
+    with pytest.raises(ValueError, match="Episodes of earlier tasks were retrieved, and 0 are"):
+        loaded.learn(1)
+    loaded.kept = model.kept
+    loaded.learn(1)
+    assert len(loaded.retrieved.trajectories) == 6
+
+
+def test_the_nearest_of_dataset_and_earlier_episodes_are_retrieved(store):
+    model = pretrained(store, env=ClockEnv(), num_retrieve=1, embodiment="dot").learn(7)
+    assert len(model.retrieved_ids) == 1 and model.retrieved_ids[0] < 4
+    model.next_task(ClockEnv())
+    model.learn(1)
+    assert model.retrieved_ids == [6]  # it begins exactly as the task does
+
+
+def test_another_task_of_a_sequence_is_drawn_by_the_seed_and_keeps_the_world_model(store):
+    models = [pretrained(store, env=DotEnv()).learn(LENGTH) for _ in range(2)]
+    before = weights(models[0])
+    for number, model in enumerate(models):
+        torch.manual_seed(number)  # torch's own generator must not matter
+        model.next_task(DotEnv())
+    one, other = (weights(model) for model in models)
+    assert same(one, other)
+    assert not same(
+        weights(models[0], "actor"), {k: before[k] for k in weights(models[0], "actor")}
+    )
+    kept = weights(models[0], "world_model.encoder", "world_model.rssm")
+    assert same(kept, {k: before[k] for k in kept})
+
+
+def test_episodes_are_kept_only_beside_a_dataset():
+    model = agent(DotEnv(), offline_ratio=0, guidance=0)
+    with pytest.raises(ValueError, match="keep_data=True keeps episodes beside a dataset"):
+        model.reset_task(keep_data=True)
+
+
 def test_one_pretrained_model_loads_onto_every_width(store, tmp_path):
     pretrained(store).save(tmp_path / "model")
     for actions in (1, 2, 4):

@@ -209,7 +209,8 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
     def next_task(self, env: Any, progress_bar: bool = False) -> None:
         """Prune and retrain the weights of the present task, then begin another one.
 
-        What was collected is dropped, since another task pays other rewards.
+        What was collected is dropped, since another task pays other rewards. The schedules begin
+        again.
 
         :raises ValueError: the sequence has no further task, or the actions have another width
         """
@@ -225,13 +226,12 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self.policy.prune(self.progress.task, tasks_left)
         self.policy.freeze_rest()
         self._retrain(progress_bar)
-        drawn_on = [self.device] if self.device.type == "cuda" else []
-        with torch.random.fork_rng(devices=drawn_on):
-            torch.manual_seed(self.streams.integer(Purpose.REDRAW, self.progress.task))
+        with self.streams.weights(Purpose.REDRAW, self.progress.task, self.device):
             self.policy.redraw()
         self.replay_buffer = ReplayBuffer()
         self.progress.reset("credit", "seen_length")
         self.progress.task += 1
+        self.num_timesteps = 0
         self.progress.updates_before = self.updates
         self.learner = self.make_learner()
         self._use_env(checked)

@@ -23,7 +23,6 @@ from wpt_agents.agents.base import Metrics
 from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
-from wpt_agents.data.units import in_units_of
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
@@ -35,7 +34,7 @@ from wpt_agents.training.guidance import draw_window
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
-from wpt_agents.training.retrieving import retrieve_ids
+from wpt_agents.training.retrieving import read_retrieved, retrieve_ids, with_kept
 from wpt_agents.training.rollout import Window
 
 NO_DATASET = (
@@ -70,6 +69,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     warmup_pays = True
     progress: WPTProgress
     retrieved: ReplayBuffer | None = None  # D_retrieval
+    kept: ReplayBuffer | None = None  # episodes of earlier tasks, to retrieve from without rewards
 
     # // Task-Agnostic World Model Pre-Training
 
@@ -192,18 +192,22 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             warnings.warn(NO_DATASET, stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not used:
             return
+        kept = self.kept.trajectories if self.kept is not None else []
         if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
             query = self.policy.embed(self.first_image())[0]
             index = self.build_index(progress_bar)
+            if kept:
+                index = with_kept(index, kept, self.policy.embed)
             width = self.action_space.shape[0]
             progress.retrieved_ids = retrieve_ids(
                 index, self.dataset, query, width, settings, self.streams
             )
             progress.retrieved_of = self.dataset.fingerprint
-        self.retrieved = ReplayBuffer()
-        chosen = self.dataset.subset(progress.retrieved_ids)
-        for trajectory in in_units_of(chosen, self.action_space):
-            self.retrieved.add(replace(trajectory, reward=None))
+        retrieved = ReplayBuffer()
+        numbers = progress.retrieved_ids
+        for trajectory in read_retrieved(self.dataset, kept, numbers, self.action_space):
+            retrieved.add(replace(trajectory, reward=None))
+        self.retrieved = retrieved
 
     def clone(self, progress_bar: bool = False) -> None:
         """// Behavior Cloning Policy Training, on the retrieved trajectories."""
@@ -295,14 +299,33 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Whether anything was done for a task."""
         return self.progress.episodes > 0 or bool(self.progress.retrieved_ids)
 
-    def reset_task(self) -> None:
+    def reset_task(self, keep_data: bool = False) -> None:
         """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.
 
         The optimisers, also that of the world model, start with new averages.
+
+        :param keep_data: keep the collected episodes as reward-free data beside the dataset, so
+            that the next task's trajectories are retrieved from both
         """
+        if keep_data and self.dataset is None:
+            raise ValueError("keep_data=True keeps episodes beside a dataset: pass dataset= first")
+        if keep_data:
+            self.kept = self.kept or ReplayBuffer()
+            for trajectory in self.replay_buffer.trajectories:
+                self.kept.add(replace(trajectory, reward=None))
         self.retrieved = None
         self.progress.reset("retrieved_ids")
         super().reset_task()
+
+    def next_task(self, env: GymEnv | str) -> None:
+        """Begin the next task of a sequence with the world model and all episodes of earlier ones.
+
+        The schedules begin again.
+        """
+        with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
+            self.reset_task(keep_data=True)
+        self.num_timesteps = 0
+        self.set_env(env)
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""

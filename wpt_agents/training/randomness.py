@@ -4,10 +4,13 @@ There is no state to save: an agent that is loaded and continues draws what it w
 it had never stopped.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+import torch
 from torch import Generator, device
 
 
@@ -44,6 +47,13 @@ class Streams:
     def torch(self, purpose: Purpose, counter: int, device: device | str = "cpu") -> Generator:
         """Return torch's generator at the beginning of a stream."""
         return Generator(device).manual_seed(self.integer(purpose, counter))
+
+    @contextmanager
+    def weights(self, purpose: Purpose, counter: int, device: device) -> Iterator[None]:
+        """Draw initial weights, which come from torch's own generators, from a stream."""
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            torch.manual_seed(self.integer(purpose, counter))
+            yield
 
     def integer(self, purpose: Purpose, counter: int) -> int:
         """Return a seed for other generators."""

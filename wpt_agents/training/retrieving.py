@@ -1,13 +1,19 @@
 """// Experience Retrieval of Algorithm 1: trajectories that begin most like the task, Eq. (5)."""
 
 import warnings
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from gymnasium import spaces
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
+from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.units import in_units_of
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.randomness import Purpose, Streams
+
+CHUNK = 256  # images that are embedded at once
 
 
 def retrieve_ids(
@@ -47,3 +53,44 @@ def retrieve_ids(
             "some, or learn with offline_ratio=0, guidance=0, kickstart=0"
         )
     return [int(i) for i in numbers]
+
+
+def with_kept(
+    index: Retriever, kept: Sequence[Trajectory], embed: Callable[[np.ndarray], np.ndarray]
+) -> Retriever:
+    """Return an index of its dataset's trajectories and, behind them, of those in memory.
+
+    :param kept: at least one trajectory
+    :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32, with the encoder of the index
+    """
+    first = [trajectory.image[0] for trajectory in kept]
+    parts = [embed(np.stack(first[at : at + CHUNK])) for at in range(0, len(first), CHUNK)]
+    return Retriever(
+        np.concatenate([index.features, *parts]),
+        np.concatenate([index.action_dims, [trajectory.action_dim for trajectory in kept]]),
+        [*index.embodiments, *(trajectory.embodiment for trajectory in kept)],
+        index.encoder_id,
+        index.dataset_id,
+    )
+
+
+def read_retrieved(
+    dataset: TrajectoryDataset,
+    kept: Sequence[Trajectory],
+    numbers: Sequence[int],
+    box: spaces.Box,
+) -> Iterator[Trajectory]:
+    """Yield retrieved trajectories by the numbers that the index of `with_kept` gives them.
+
+    :param box: the task's actions, in whose units those of the dataset are brought
+    :raises ValueError: trajectories in memory were retrieved and are not there
+    """
+    stored = len(dataset)
+    if max(numbers, default=0) >= stored + len(kept):
+        raise ValueError(
+            f"Episodes of earlier tasks were retrieved, and {len(kept)} are there: add them to "
+            "model.kept, or call reset_task()"
+        )
+    chosen = dataset.subset([number for number in numbers if number < stored])
+    yield from in_units_of(chosen, box)
+    yield from (kept[number - stored] for number in numbers if number >= stored)

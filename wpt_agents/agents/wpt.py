@@ -318,12 +318,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         super().reset_task()
 
     def next_task(self, env: GymEnv | str) -> None:
-        """Begin the next task of a sequence with the world model and all episodes of earlier ones.
+        """Begin the next task of a sequence with the world model and the episodes of earlier ones.
 
-        The schedules begin again.
+        The episodes are kept where there is a dataset to keep them beside. The schedules begin
+        again.
         """
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
-            self.reset_task(keep_data=True)
+            self.reset_task(keep_data=self.dataset is not None)
         self.num_timesteps = 0
         self.set_env(env)
 

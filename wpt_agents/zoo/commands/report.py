@@ -42,6 +42,7 @@ def report(
     """
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_tables, tables
+    from wpt_agents.zoo.report.figure4 import find_sequences
     from wpt_agents.zoo.report.folders import find_finished, read_results
     from wpt_agents.zoo.report.page import write_page
     from wpt_agents.zoo.terminal import console
@@ -51,7 +52,7 @@ def report(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
     results = read_results(folder)
-    if not results:
+    if not results and not find_sequences(folder):
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows = tables.summarise(results)
     policies = tables.policies(results)

@@ -28,6 +28,13 @@ MethodNames = Annotated[
 Frames = Annotated[
     int | None, typer.Option(help="Simulator frames of fine-tuning (`learn.frames`).")
 ]
+SequenceName = Annotated[
+    str,
+    typer.Option(
+        help="A sequence of tasks that each method learns one after the other, in place of "
+        "--suite and --tasks: `ant` is Fig. 4 of the paper."
+    ),
+]
 Force = Annotated[bool, typer.Option(help="Replace finished runs.")]
 DryRun = Annotated[bool, typer.Option(help="Show the plan and do nothing.")]
 Watch = Annotated[
@@ -74,6 +81,7 @@ def list_tasks(
     from wpt_agents.files.names import unknown_name
     from wpt_agents.zoo.plan.methods import METHODS
     from wpt_agents.zoo.plan.presets import preset_names, suite_names
+    from wpt_agents.zoo.plan.sequences import sequence_names
     from wpt_agents.zoo.tasks import short_name
     from wpt_agents.zoo.terminal import console
 
@@ -90,6 +98,7 @@ def list_tasks(
     for name in suite_names():
         console.print(f"presets of {name}: {', '.join(preset_names(name))}")
     console.print(f"methods: {', '.join(METHODS)}")
+    console.print(f"sequences: {', '.join(sequence_names())}")
 
 
 def pretrain_model(
@@ -133,6 +142,7 @@ def pretrain_model(
 def run_benchmark(
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006
+    sequence: SequenceName = "",
     preset: PresetName = "demo",
     seeds: Seeds = "1",
     method: MethodNames = ["wpt"],  # noqa: B006
@@ -160,16 +170,27 @@ def run_benchmark(
     curve, video and `result.json`. Finished stages are reused.
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
+
+    Fig. 4: `python -m wpt_agents.zoo run --sequence ant --method wpt packnet --preset tiny`
     """
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.runs import make_plan
-    from wpt_agents.zoo.run.dispatch import do_plan, preview
+    from wpt_agents.zoo.plan.sequences import make_sequences
+    from wpt_agents.zoo.run.dispatch import do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
 
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
+    if sequence:
+        if tasks or watch or engine != "none":
+            raise ValueError("--sequence takes neither --tasks nor --watch, and no --engine")
+        where = out, workers, device, data
+        jobs = make_sequences(sequence, preset, seeds, method, changes, *where)
+        if not do_sequences(jobs, force, dry_run):
+            raise typer.Exit(1)
+        return
     runs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
     if watch:
         show_standings(runs)

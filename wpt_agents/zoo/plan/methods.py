@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.jsrl import JSRL
+from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
@@ -45,6 +46,7 @@ RESERVED = {
 AGENTS: dict[str, type[BaseAlgorithm]] = {
     "drqv2": DrQv2,
     "jsrl": JSRL,
+    "packnet": PackNet,
     "r3m": R3M,
     "rlpd": RLPD,
     "sac": SAC,
@@ -148,6 +150,8 @@ METHODS = {
     "drq-v2": Method(DrQv2, **MODEL_FREE, needs_data=False),
     "r3m": Method(R3M, shared=(), policy="CnnPolicy"),
     "jsrl-bc": Method(JSRL, **MODEL_FREE),
+    # For a sequence of tasks; on a single one it is DrQ-v2.
+    "packnet": Method(PackNet, **MODEL_FREE, needs_data=False),
     "uds": Method(RLPD, {"label": "zero"}, **MODEL_FREE),
     "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
     # An upper bound for the two before it: with --data that hold rewards (`collect --rewards`).

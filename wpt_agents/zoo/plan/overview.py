@@ -7,6 +7,7 @@ from rich.table import Table
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.sequence_result import read_row
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 
@@ -15,7 +16,8 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
     """Print what would be done, and what exists already."""
     table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
     for job in jobs:
-        state = "finished" if read_result(job.folder) and not force else "to do"
+        done = read_result(job.folder) or read_row(job.folder)
+        state = "finished" if done and not force else "to do"
         updates = "-" if job.updates is None else f"{job.updates:,}"
         names = short_name(job.task), job.method, str(job.seed)
         table.add_row(*names, f"{job.preset.steps:,}", updates, state, str(job.folder))

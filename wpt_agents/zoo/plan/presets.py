@@ -236,16 +236,23 @@ def _read_suite(suite: str) -> SuiteFile:
     return SuiteFile(**content)
 
 
-def load_preset(suite: str, name: str, settings: Sequence[str] = ()) -> Preset:
-    """The preset `name` of `suite`, changed by `settings`.
+def load_preset(
+    suite: str,
+    name: str,
+    settings: Sequence[str] = (),
+    changes: Sequence[Mapping[str, Mapping[str, Any]]] = (),
+) -> Preset:
+    """The preset `name` of `suite`, changed by `changes` and then by `settings`.
 
     :param settings: each "section.key=value", or "key=value" for a keyword of WPT
+    :param changes: sections in the form of the YAML files
     """
     content = _read_suite(suite)
     if name not in content.presets:
         raise unknown_name(f"{suite} preset", name, content.presets)
     values: dict[str, dict[str, Any]] = {}
-    for part in (content.default, content.presets[name] or {}, *map(_setting, settings)):
+    parts = content.default, content.presets[name] or {}, *changes, *map(_setting, settings)
+    for part in parts:
         for title, section in part.items():
             values[title] = {**values.get(title, {}), **(section or {})}
     return Preset.of(values)

@@ -40,6 +40,7 @@ class Run:
     :param data: the user's own dataset, None for the preset's
     :param data_name: how the user wrote `data`, which may have been made absolute since
     :param command: what the user typed, whichever process does the run
+    :param sequence: the name of the sequence of tasks that this is one task of, empty for none
     """
 
     task: Task
@@ -54,6 +55,7 @@ class Run:
     changes: tuple[Change, ...] = ()
     data_name: str = ""
     command: str = field(default_factory=this_command, compare=False)
+    sequence: str = ""
 
     def __post_init__(self) -> None:
         find_method(self.method)
@@ -72,9 +74,14 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """out/preset/method/task_seed, the layout that RL Zoo's plots read."""
-        name = f"{short_name(self.task)}_{self.seed}"
-        return self.out / self.preset_name / self.method / name
+        """out/preset/method/task_seed, the layout that RL Zoo's plots read.
+
+        A task of a sequence is in out/preset/method/sequence_seed/task.
+        """
+        folder = self.out / self.preset_name / self.method
+        if self.sequence:
+            return folder / f"{self.sequence}_{self.seed}" / short_name(self.task)
+        return folder / f"{short_name(self.task)}_{self.seed}"
 
     @property
     def title(self) -> str:
@@ -174,13 +181,15 @@ def make_plan(
     workers: int,
     device: str,
     data: Path | None = None,
+    sections: Sequence[Mapping[str, Mapping[str, Any]]] = (),
 ) -> list[Run]:
     """Return one run for each task, method and seed.
 
+    :param sections: changes of the preset before those of `settings`
     :raises ValueError: an invalid name or setting
     """
     rows = find_tasks(suite, tasks)
-    resolved = load_preset(suite, preset, settings)
+    resolved = load_preset(suite, preset, settings, sections)
     for row in rows:
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")

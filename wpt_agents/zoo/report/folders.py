@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
+from wpt_agents.zoo import sequence_result
 from wpt_agents.zoo.report.aggregates import Experiment
 from wpt_agents.zoo.result import FILE, Result, read_result
 
@@ -105,7 +106,7 @@ def find_unfinished(folder: Path) -> list[Unfinished]:
     """Return every run folder below `folder` that has no result yet."""
     entries = []
     for path in sorted(folder.glob("**/config.yaml")):
-        if not (path.parent / FILE).exists():
+        if not any((path.parent / name).exists() for name in (FILE, sequence_result.FILE)):
             error = path.parent / "error.txt"
             entries.append(
                 Unfinished(path.parent, error.read_text(encoding="utf-8") if error.exists() else "")

@@ -11,7 +11,15 @@ import yaml
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted, unknown_name
-from wpt_agents.zoo.report import aggregates, figure2, headline, paper_tables, sections, tables
+from wpt_agents.zoo.report import (
+    aggregates,
+    figure2,
+    figure4,
+    headline,
+    paper_tables,
+    sections,
+    tables,
+)
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
 from wpt_agents.zoo.report.names import policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
@@ -28,12 +36,18 @@ def write_page(folder: Path, path: Path, media: str = "first") -> None:
     """
     if media not in MEDIA:
         raise unknown_name("choice of media", media, MEDIA)
-    page = render(find_finished(folder), find_unfinished(folder), media)
+    sequences = figure4.find_sequences(folder)
+    page = render(find_finished(folder), find_unfinished(folder), media, sequences)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
-def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: str = "first") -> str:
+def render(
+    runs: Sequence[Finished],
+    unfinished: Sequence[Unfinished],
+    media: str = "first",
+    sequences: Sequence[figure4.Finished] = (),
+) -> str:
     """Return the page's HTML."""
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
@@ -54,6 +68,7 @@ def render(runs: Sequence[Finished], unfinished: Sequence[Unfinished], media: st
             for suite in dict.fromkeys(result.suite for result in results)
         ],
         figure_2=figure2.figure_2(runs, names),
+        figures_4=figure4.figures_4(sequences),
         tables=paper_tables.paper_tables(runs, names),
         policies=tables.by_task(tables.policies(results)),
         policy_cells=tables.policy_cells,

@@ -76,6 +76,7 @@ class Section:
     :param names: of the suite's experiments
     :param all_names: of all experiments of the page, for the colours
     :param tasks: the number of the suite's tasks in the paper
+    :param ablation_missing: the methods of Fig. 5 of which there is no run
     """
 
     name: str
@@ -87,6 +88,7 @@ class Section:
     improvements: Sequence[Improvement]
     profile: str
     ablation: str
+    ablation_missing: Sequence[str]
     curves: Sequence[str]
 
 
@@ -107,6 +109,7 @@ def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
         improvements=improvements(experiments, names),
         profile=profile(suite, experiments, names),
         ablation=ablation(suite, experiments, names),
+        ablation_missing=[m for m in ABLATION if m not in {one.method for one in experiments}],
         curves=curves(suite, runs, names),
     )
 

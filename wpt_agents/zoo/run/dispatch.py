@@ -8,9 +8,11 @@ from wpt_agents.zoo.machine import check_machine, choose_threads
 from wpt_agents.zoo.plan.estimate import check_space, summary
 from wpt_agents.zoo.plan.overview import show_plan
 from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.run.engines import Resources, run_on
 from wpt_agents.zoo.run.folder import check_folder
 from wpt_agents.zoo.run.runner import run_all
+from wpt_agents.zoo.run.sequences import run_sequences
 
 
 def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
@@ -38,3 +40,16 @@ def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources)
         choose_threads(runs[0].preset.wpt.get("size", "paper"))
         return run_all(runs, force)
     return run_on(engine, runs, force, resources)
+
+
+def do_sequences(jobs: Sequence[SequenceRun], force: bool, dry_run: bool) -> bool:
+    """Check the sequences, then do them; with `dry_run`, only show them.
+
+    :return: whether all are finished, or shown
+    """
+    runs = [run for job in jobs for run in job.runs]
+    if dry_run:
+        show_plan(runs, force)
+    check_machine("none", runs[0].device)
+    check_space(runs)
+    return dry_run or run_sequences(jobs, force)

@@ -28,20 +28,30 @@ def check_folder(job: Run, force: bool) -> None:
 
     :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
     """
-    path = job.folder / "config.yaml"
-    others = {item.name for item in job.folder.glob("[!.]*")} - {"lock", "log.txt"}
+    check_config(job.folder, job.config(), job, force)
+
+
+def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool) -> None:
+    """Refuse a folder whose `config.yaml` has other settings.
+
+    :param config: the settings
+    :param job: whose agent they are of
+    :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
+    """
+    path = folder / "config.yaml"
+    others = {item.name for item in folder.glob("[!.]*")} - {"lock", "log.txt"}
     if others and not path.exists():
-        raise ValueError(f"{job.folder} is no run folder: it has no config.yaml; use another --out")
+        raise ValueError(f"{folder} is no run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
         section = job.algorithm.section
         keywords = {section: dict(defaults(job.algorithm.agent))}
         usual = _flat(Preset().as_dict() | keywords)  # of keys that older versions do not know
         before = usual | _flat(yaml.safe_load(path.read_text(encoding="utf-8")))
-        now = usual | _flat(json.loads(json.dumps(job.config())))
+        now = usual | _flat(json.loads(json.dumps(config)))
         differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))
         if differ:
             raise ValueError(
-                f"{job.folder} holds a run with other settings ({', '.join(differ)}); "
+                f"{folder} holds a run with other settings ({', '.join(differ)}); "
                 "use another --out, or --force to replace it"
             )
 

@@ -55,23 +55,33 @@ def make_agent(
     checkpoint: Checkpoint | None = None,
 ) -> BaseAlgorithm:
     """Make the agent to fine-tune: from the checkpoint, from the pre-trained model, or new."""
-    method = run.algorithm
+    if checkpoint is not None:
+        return load_agent(run, venv, dataset, checkpoint.model)
+    if start is None:
+        agent = without_progress_bar(run.algorithm.agent)
+        return agent(run.algorithm.policy, venv, **_keywords(run, dataset))
+    model: Any = load_agent(run, venv, dataset, start)
+    model.reset_task()  # heads, actor and critic are drawn by this run's seed, not pre-training's
+    return model
+
+
+def load_agent(
+    run: Run, venv: VecEnv, dataset: TrajectoryDataset | None, path: Path
+) -> BaseAlgorithm:
+    """Read the agent's model file, with the keywords of the run."""
+    agent = without_progress_bar(run.algorithm.agent)
+    return agent.load(path, env=venv, **_keywords(run, dataset))
+
+
+def _keywords(run: Run, dataset: TrajectoryDataset | None) -> dict[str, Any]:
     task = {
         "dataset": dataset,
         "embodiment": run.task.embodiment,
         "episode_length": episode_steps(run.task.id, run.shared.env),
     }
-    known = {name: value for name, value in task.items() if method.takes(name)}
+    known = {name: value for name, value in task.items() if run.algorithm.takes(name)}
     specific = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
-    keywords: dict[str, Any] = {"seed": run.seed, "device": run.device, **specific, **known}
-    agent: Any = without_progress_bar(method.agent)
-    if checkpoint is not None:
-        return agent.load(checkpoint.model, env=venv, **keywords)
-    if start is None:
-        return agent(method.policy, venv, **keywords)
-    model = agent.load(start, env=venv, **keywords)
-    model.reset_task()  # heads, actor and critic are drawn by this run's seed, not pre-training's
-    return model
+    return {"seed": run.seed, "device": run.device, **specific, **known}
 
 
 def without_progress_bar(agent: type[BaseAlgorithm]) -> type[BaseAlgorithm]:

@@ -109,7 +109,7 @@ def do_stages(job: Run) -> Result:
         with clock("pretrain"):
             start = pretrain(job.shared, dataset)
     checkpoint = last_checkpoint(job.folder)
-    _prepare_logs(job, checkpoint)
+    prepare_logs(job, checkpoint)
     with closing(make_training_env(job)) as venv:
         agent = make_agent(job, venv, dataset, start, checkpoint)
         if dataset is not None and checkpoint is None:  # a resumed run has retrieved already
@@ -134,7 +134,7 @@ def metric_of(task: Task) -> Metric:
     return "success" if task.metric == "success" else "return"
 
 
-def _prepare_logs(job: Run, checkpoint: Checkpoint | None) -> None:
+def prepare_logs(job: Run, checkpoint: Checkpoint | None) -> None:
     """Put the logs back to the checkpoint's state, or remove leftovers if there is none."""
     if checkpoint is not None:
         checkpoint.restore_logs(job.folder)

@@ -1,0 +1,80 @@
+"""The report of a sequence of tasks: Fig. 4 and the matrix of returns, from made-up results."""
+
+import numpy as np
+import pytest
+from test_zoo_page import read, text
+from zoo_command import call
+
+from wpt_agents.zoo.report.figure4 import figures_4, find_sequences
+from wpt_agents.zoo.report.page import write_page
+from wpt_agents.zoo.result import Score, Variant
+from wpt_agents.zoo.sequence_result import Row, SequenceResult, write_sequence
+
+TASKS = ("dmc-quadruped-stand", "dmc-quadruped-walk")
+
+
+def make_sequence(out, method, returns, seed=0, evaluated=True):
+    """Writes a finished sequence: returns[k][j] is the return on task j after task k."""
+    folder = out / "tiny" / method / f"ant_{seed}"
+    rows = []
+    for k, task in enumerate(TASKS):
+        (folder / task).mkdir(parents=True)
+        scores = {TASKS[j]: Score((value,)) for j, value in enumerate(returns[k])}
+        rows.append(Row(task, scores, 5, 1.0, 1.0))
+        if evaluated:
+            arrays = {
+                "timesteps": np.array([50, 100]),
+                "results": np.array([[1.0], [returns[k][k]]]),
+            }
+            np.savez(folder / task / "evaluations.npz", **arrays)
+        else:
+            lines = ["#{}", "r,l,t", *(f"{value}.0,10,1" for value in range(25))]
+            (folder / task / "0.monitor.csv").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "config.yaml").write_text("task: ant", encoding="utf-8")
+    result = SequenceResult("dmc", "ant", method, Variant("tiny"), seed, 400, 200, rows, "0123")
+    write_sequence(folder, result)
+    return result
+
+
+@pytest.fixture
+def sequences(tmp_path):
+    make_sequence(tmp_path, "wpt", [[800.0], [100.0, 600.0]])
+    make_sequence(tmp_path, "wpt", [[600.0], [300.0, 800.0]], seed=1)
+    make_sequence(tmp_path, "packnet", [[300.0], [300.0, 400.0]], evaluated=False)
+    return tmp_path
+
+
+def test_a_sequence_is_read_back_as_it_was_written(tmp_path):
+    result = make_sequence(tmp_path, "wpt", [[800.0], [100.0, 600.0]])
+    [(folder, found)] = find_sequences(tmp_path)
+    assert found == result and folder.name == "ant_0"
+    assert found.command.endswith("--method wpt --preset tiny --frames 400 --seeds 0-0")
+
+
+def test_the_matrix_is_the_mean_over_seeds_and_packnet_is_a_share_of_wpt(sequences):
+    [figure] = figures_4(find_sequences(sequences))
+    matrices = {matrix.name: matrix for matrix in figure.matrices}
+    assert matrices["wpt"].rows == [[700.0], [200.0, 700.0]]
+    assert matrices["packnet"].rows == [[300.0], [300.0, 400.0]]
+    assert matrices["packnet"].share == pytest.approx(0.5)  # (300 + 400) / (700 + 700)
+    assert len(figure.curves) == 2 and not figure.missing
+
+
+def test_the_page_shows_the_figure_and_what_is_missing(sequences, monkeypatch, tmp_path_factory):
+    assert call(monkeypatch, "report", sequences) == 0
+    page = (sequences / "report" / "index.html").read_text(encoding="utf-8")
+    words = text(page)
+    assert "Figure 4: the sequence ant, tiny, 400 frames a task" in words
+    assert "after quadruped-walk" in words and "50 % of WPT" in words
+    assert "stopped, or still running" not in words
+    assert page[page.index('id="figure-4-1"') :].count("<svg") == 2
+    assert not read(page).open
+    other = tmp_path_factory.mktemp("other")
+    make_sequence(other, "wpt", [[800.0], [100.0, 600.0]])
+    write_page(other, other / "index.html")
+    assert "Missing: packnet." in text((other / "index.html").read_text(encoding="utf-8"))
+
+
+def test_a_folder_without_any_result_is_refused(monkeypatch, tmp_path, capsys):
+    assert call(monkeypatch, "report", tmp_path) != 0
+    assert "No finished run" in capsys.readouterr().err

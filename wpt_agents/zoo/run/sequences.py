@@ -1,0 +1,222 @@
+"""A sequence of tasks that one agent learns one after the other, resumable at any moment.
+
+Each task has a folder with the logs, checkpoints and model file of an ordinary run, and with
+`scores.json` once it is finished. An agent goes on to the next task from files alone, so a sequence
+that was killed continues as one that never stopped. The episodes of all tasks are kept until the
+sequence ends. `sequence.json` is written last.
+"""
+
+import shutil
+import traceback
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.markup import escape
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv
+
+from wpt_agents.agents.packnet import PackNet
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.replay import ReplayBuffer
+from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.judge.evaluation import evaluate
+from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.plan.sequences import SequenceRun
+from wpt_agents.zoo.provenance import commit, system
+from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.run.checkpoints import Checkpoint, last_checkpoint
+from wpt_agents.zoo.run.folder import check_config, clear
+from wpt_agents.zoo.run.learning import (
+    build_index,
+    learn,
+    load_agent,
+    make_agent,
+    make_training_env,
+)
+from wpt_agents.zoo.run.locks import locked, write_json
+from wpt_agents.zoo.run.logs import go_to_episode
+from wpt_agents.zoo.run.runner import prepare_logs
+from wpt_agents.zoo.run.shared import collect_data, pretrain
+from wpt_agents.zoo.sequence_result import (
+    Row,
+    SequenceResult,
+    read_row,
+    read_sequence,
+    write_row,
+    write_sequence,
+)
+from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.terminal import console, say
+
+
+def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
+    """Do the sequences one after the other; one that fails is reported and stops no other.
+
+    :param force: whether to replace finished sequences
+    :return: whether all are finished
+    """
+    for job in jobs:
+        check_config(job.folder, job.config(), job.runs[0], force)
+    finished = True
+    for number, job in enumerate(jobs, 1):
+        say(f"sequence {number}/{len(jobs)}", job.title)
+        try:
+            run_sequence(job, force)
+        except Exception as error:  # whatever one sequence dies of, the others are not to blame
+            finished = False
+            console.print(f"[red]failed[/red]: {escape(str(error))}")
+            continue
+        console.print(f"Folder: [bold]{escape(str(job.folder.resolve()))}[/bold]")
+    return finished
+
+
+def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
+    """Do what is not done yet of a sequence and return its result."""
+    done = None if force else read_sequence(job.folder)
+    if done is not None:
+        say("sequence", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")
+        return done
+    with locked(job.folder / "lock"):
+        if force:
+            (job.folder / "sequence.json").unlink(missing_ok=True)
+            clear(job.folder)
+        (job.folder / "error.txt").unlink(missing_ok=True)
+        with replacing(job.folder / "config.yaml") as temporary:
+            temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False), encoding="utf-8")
+        write_json(job.folder / "system.json", system())
+        (job.folder / "command.txt").write_text(job.runs[0].command + "\n", encoding="utf-8")
+        try:
+            return _do_tasks(job)
+        except Exception:
+            (job.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+            raise
+
+
+def _do_tasks(job: SequenceRun) -> SequenceResult:
+    rows = []
+    for number, run in enumerate(job.runs):
+        row = read_row(run.folder)
+        if row is None:
+            row = _learn_task(job, number)
+            write_row(run.folder, row)
+            shutil.rmtree(run.folder / "checkpoints", ignore_errors=True)
+        rows.append(row)
+        say("return", f"{row.learned.mean:.1f} on {row.task}")
+    first = job.runs[0]
+    result = SequenceResult(
+        suite=first.task.suite,
+        sequence=job.name,
+        method=first.method,
+        variant=first.variant,
+        seed=first.seed,
+        frames=first.preset.learn.frames,
+        steps=first.preset.steps,
+        rows=rows,
+        commit=commit(),
+    )
+    write_sequence(job.folder, result)
+    for run in job.runs:
+        shutil.rmtree(run.folder / "replay", ignore_errors=True)
+    return result
+
+
+def _learn_task(job: SequenceRun, number: int) -> Row:
+    """Learn one task, then play it and all before it."""
+    run = job.runs[number]
+    run.folder.mkdir(parents=True, exist_ok=True)
+    dataset = collect_data(run.shared) if run.algorithm.needs_data else None
+    start = None
+    if run.algorithm.pretrained:
+        assert dataset is not None, run.method
+        start = pretrain(run.shared, dataset)
+    checkpoint = last_checkpoint(run.folder)
+    prepare_logs(run, checkpoint)
+    with closing(make_training_env(run)) as venv:
+        agent: Any = _begin(job, number, venv, dataset, start, checkpoint)
+        if dataset is not None and checkpoint is None:
+            build_index(run, agent)
+        effort = learn(run, agent, checkpoint)
+        agent.save(run.folder / "model.zip")
+    made = sum(row.updates for row in map(read_row, _folders(job, number)) if row is not None)
+    scores = {
+        short_name(played.task): _play(played, policy_of(agent, place))
+        for place, played in enumerate(job.runs[: number + 1])
+    }
+    return Row(
+        task=short_name(run.task),
+        scores=scores,
+        updates=agent.updates - made,
+        seconds=round(effort.seconds, 1),
+        cpu_seconds=round(effort.cpu_seconds, 1),
+    )
+
+
+def _begin(
+    job: SequenceRun,
+    number: int,
+    venv: VecEnv,
+    dataset: TrajectoryDataset | None,
+    start: Path | None,
+    checkpoint: Checkpoint | None,
+) -> BaseAlgorithm:
+    """Return the agent of a task: as it was interrupted, or as the task before left it."""
+    run = job.runs[number]
+    folders = _folders(job, number)
+    if checkpoint is not None or number == 0:
+        agent: Any = make_agent(run, venv, dataset, start, checkpoint)
+        _keep(agent, folders)
+        return agent
+    agent = load_agent(run, venv, dataset, folders[-1] / "model.zip")
+    agent.replay_buffer = _episodes(folders[-1:])
+    _keep(agent, folders[:-1])
+    agent.next_task(venv)
+    go_to_episode(venv, agent.episodes)  # no initial state comes twice
+    return agent
+
+
+def _folders(job: SequenceRun, number: int) -> list[Path]:
+    """Return the folders of the tasks before one."""
+    return [run.folder for run in job.runs[:number]]
+
+
+def _episodes(folders: Sequence[Path]) -> ReplayBuffer:
+    """Return the episodes of tasks, in the order of collection."""
+    buffer = ReplayBuffer()
+    for folder in folders:
+        for path in sorted((folder / "replay").glob("episode-*")):
+            for trajectory in ReplayBuffer.load(path).trajectories:
+                buffer.add(trajectory)
+    return buffer
+
+
+def _keep(agent: BaseAlgorithm, folders: Sequence[Path]) -> None:
+    """Give WPT the episodes of earlier tasks as reward-free data."""
+    if isinstance(agent, WPT) and folders:
+        agent.kept = ReplayBuffer()
+        for trajectory in _episodes(folders).trajectories:
+            agent.kept.add(replace(trajectory, reward=None))
+
+
+def policy_of(agent: BaseAlgorithm, task: int) -> PolicyPredictor:
+    """Return what acts on a task of the sequence: PackNet keeps a policy for each of them."""
+    return agent.policy_of(task) if isinstance(agent, PackNet) else agent
+
+
+def _play(run: Run, policy: PolicyPredictor) -> Score:
+    episodes = run.preset.evaluate.episodes
+    name = short_name(run.task)
+    return evaluate(
+        policy,
+        run.task.id,
+        run.shared.env,
+        episodes,
+        run.evaluation_seed,
+        name,
+        run.algorithm.wrap,
+    )

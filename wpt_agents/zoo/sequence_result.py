@@ -1,0 +1,121 @@
+"""What a sequence of tasks found; this module alone reads and writes `sequence.json`.
+
+Example::
+
+    result = read_sequence(Path("runs/tiny/packnet/ant_0"))
+    result.rows[2].scores["dmc-quadruped-stand"].mean  # the first task, after the third
+"""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.result import Change, Score, Variant
+
+FILE = "sequence.json"
+ROW = "scores.json"  # in the folder of each task that is finished
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was found when a task of the sequence ended.
+
+    :param task: the task that was learned
+    :param scores: of this task and all before it, by task
+    :param updates: gradient updates for this task
+    :param seconds: wall-clock seconds of learning it
+    :param cpu_seconds: processor seconds of learning it
+    """
+
+    task: str
+    scores: Mapping[str, Score]
+    updates: int
+    seconds: float
+    cpu_seconds: float
+
+    @property
+    def learned(self) -> Score:
+        """The score on the task that was learned, the number of Fig. 4."""
+        return self.scores[self.task]
+
+
+@dataclass(frozen=True)
+class SequenceResult:
+    """Everything that a finished sequence found.
+
+    :param frames: simulator frames of each task
+    :param steps: calls of `env.step` of each task
+    :param rows: one for each task, in the order of learning
+    """
+
+    suite: str
+    sequence: str
+    method: str
+    variant: Variant
+    seed: int
+    frames: int
+    steps: int
+    rows: Sequence[Row]
+    commit: str | None = None
+
+    @property
+    def command(self) -> str:
+        """A command that repeats the runs of the sequence."""
+        words = ["python", "-m", "wpt_agents.zoo", "run", "--sequence", self.sequence]
+        words += ["--method", self.method, "--preset", self.variant.preset]
+        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
+        for change in self.variant.changes:
+            words += ["--set", str(change)]
+        if self.variant.data is not None:
+            words += ["--data", self.variant.data]
+        return shlex.join(words)
+
+
+def write_row(folder: Path, row: Row) -> None:
+    """Write what was found when a task ended, as a whole or not at all."""
+    with replacing(folder / ROW) as temporary:
+        temporary.write_text(json.dumps(asdict(row), indent=1), encoding="utf-8")
+
+
+def read_row(folder: Path) -> Row | None:
+    """Read what `write_row` wrote, None while the task is not finished."""
+    path = folder / ROW
+    return _row(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+
+
+def write_sequence(folder: Path, result: SequenceResult) -> None:
+    """Write the result of a sequence, as a whole or not at all."""
+    stored = asdict(result) | {"command": result.command}
+    with replacing(folder / FILE) as temporary:
+        temporary.write_text(json.dumps(stored, indent=1), encoding="utf-8")
+
+
+def read_sequence(folder: Path) -> SequenceResult | None:
+    """Read the result of the sequence in `folder`, None while it is not finished.
+
+    :raises ValueError: the file is damaged
+    """
+    path = folder / FILE
+    if not path.exists():
+        return None
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored.pop("command")
+        variant = stored.pop("variant")
+        variant["changes"] = tuple(Change(**change) for change in variant["changes"])
+        rows = [_row(row) for row in stored.pop("rows")]
+        return SequenceResult(variant=Variant(**variant), rows=rows, **stored)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
+
+
+def _row(stored: dict[str, Any]) -> Row:
+    scores = {
+        task: Score(tuple(score["returns"]), tuple(score["successes"]))
+        for task, score in stored.pop("scores").items()
+    }
+    return Row(scores=scores, **stored)

@@ -12,6 +12,7 @@ import yaml
 from debug_agent import agent, noise
 from hub_stand_in import hub  # noqa: F401  (a fixture)
 from imageio_ffmpeg import count_frames_and_secs
+from PIL import Image
 from run_folders import make_run
 from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
@@ -53,6 +54,11 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     video = tmp_path / "new" / "video.mp4"
     assert call(monkeypatch, "enjoy", folder, "--out", video, "--size", "64") == 0
     assert count_frames_and_secs(video)[0] >= DOT.frames
+    animation = tmp_path / "policy.gif"
+    assert call(monkeypatch, "enjoy", folder, "--out", animation, "--size", "64") == 0
+    assert "MB)" in capsys.readouterr().out
+    with Image.open(animation) as pictures:
+        assert pictures.width > 3 * 64 and pictures.n_frames > 1  # the strip is beside the film
     model = shutil.copy(folder / "model.zip", tmp_path / "alone.zip")
     words = ["--task", "dmc-dot", "--episodes", "1"]
     assert call(monkeypatch, "eval", model, "--episodes", "1") == 2  # nothing says what it is for
@@ -114,6 +120,7 @@ def test_a_moved_out_is_not_done_again(tmp_path):
         (["eval", "alone.zip"], "add --task"),
         (["eval", "run", "--task", "dmc-walker-rum"], "Did you mean 'walker-run'"),
         (["enjoy", "run", "--size", "100"], "multiple of 16"),
+        (["enjoy", "run", "--out", "film.avi"], "ends in .mp4 or .gif"),
         (["eval", "damaged"], "is no run's configuration"),
         (["push", "run", "noname"], "write user/name"),
         (["push", "empty", "user/name"], "holds no model.zip"),

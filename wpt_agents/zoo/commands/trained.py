@@ -62,13 +62,16 @@ def enjoy_model(
     task: ForTask = "",
     policy: Policy = "wpt",
     seed: Annotated[int, typer.Option(min=0, help="The seed of the initial state.")] = 10_000,
-    out: Annotated[Path, typer.Option(help="The file of the video.")] = Path("enjoy.mp4"),
+    out: Annotated[Path, typer.Option(help="The file to write: an .mp4 or a .gif.")] = Path("enjoy.mp4"),
     size: Annotated[
         int, typer.Option(min=64, help="The width of the video, a multiple of 16.")
     ] = 256,
     device: Device = "auto",
 ) -> None:
     """Film an episode of a trained model to an mp4, which any browser plays.
+
+    With `--out policy.gif` it writes a GIF at half speed. Beside the episode are true images above
+    dreamed ones, which the world model predicts from the first five images and all actions.
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -78,8 +81,9 @@ def enjoy_model(
     if size % 16:
         raise ValueError(f"--size {size}: a video's width must be a multiple of 16.")
     trained = find_trained(run, task)
-    total = trained.record(trained.load(policy, device), out, seed, size)
-    typer.echo(f"Return {number(total)}. Video: {out.resolve()}")
+    total = trained.record(out, policy, seed, size, device)
+    megabytes = out.stat().st_size / 1e6
+    typer.echo(f"Return {number(total)}. Film: {out.resolve()} ({megabytes:.1f} MB)")
 
 
 def diagnose_model(

@@ -7,19 +7,24 @@ from types import SimpleNamespace
 from typing import Any
 
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import TASKS
 
+from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.judge.evaluation import evaluate, film
+from wpt_agents.zoo.judge.prediction import CONTEXT
 from wpt_agents.zoo.machine import check_device
 from wpt_agents.zoo.pictures import runs
+from wpt_agents.zoo.pictures.animation import animate
 from wpt_agents.zoo.plan.methods import METHODS, Method, find_method
 from wpt_agents.zoo.plan.presets import EnvSettings
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.tasks import find_tasks
 
 POLICIES = ("wpt", "prior")  # "wpt" is the agent, whichever method trained it
+FILMS = (".mp4", ".gif")
 
 
 @dataclass(frozen=True)
@@ -40,10 +45,17 @@ class Trained:
 
         :raises ValueError: an unknown policy, or a model without a prior actor
         """
+        return self.choose(self.load_agent(device), policy)
+
+    def load_agent(self, device: str = "auto") -> BaseAlgorithm:
+        """Load the agent, without a dataset."""
+        check_device(device)
+        return self.method.agent.load(self.model, device=device)
+
+    def choose(self, agent: BaseAlgorithm, policy: str) -> PolicyPredictor:
+        """Return the agent ("wpt") or its prior actor ("prior")."""
         if policy not in POLICIES:
             raise unknown_name("policy", policy, POLICIES)
-        check_device(device)
-        agent = self.method.agent.load(self.model, device=device)
         if policy == "wpt":
             return agent
         prior: PolicyPredictor | None = getattr(agent, "prior", None)
@@ -55,13 +67,29 @@ class Trained:
         """Return the score over seeded episodes."""
         return evaluate(policy, self.task, self.env, episodes, seed, wrap=self.method.wrap)
 
-    def record(self, policy: PolicyPredictor, path: Path, seed: int, size: int = 256) -> float:
-        """Film an episode to `path` (mp4) and return its return."""
-        trajectory, frames, fps = film(
-            policy, self.task, self.env, seed, size, wrap=self.method.wrap
+    def record(
+        self, path: Path, policy: str = "wpt", seed: int = 0, size: int = 256, device: str = "auto"
+    ) -> float:
+        """Film an episode to `path` and return its return.
+
+        :param path: an `.mp4`; or a `.gif`, which also shows what the agent's world model, if it
+            has one, predicts of the whole episode from its first images and the actions
+        :raises ValueError: an unknown policy, a model without a prior actor, another ending
+        """
+        if path.suffix not in FILMS:
+            raise ValueError(f"{path}: the name of a film ends in {' or '.join(FILMS)}")
+        agent = self.load_agent(device)
+        trajectory, shots, fps = film(
+            self.choose(agent, policy), self.task, self.env, seed, size, wrap=self.method.wrap
         )
         path.parent.mkdir(parents=True, exist_ok=True)
-        runs.video(path, frames, fps)
+        if path.suffix == ".mp4":
+            runs.video(path, shots, fps)
+        elif isinstance(agent, WPT):
+            dreamed = agent.open_loop(trajectory, CONTEXT, len(trajectory))
+            animate(path, shots, fps, trajectory.image[: len(dreamed)], dreamed, CONTEXT)
+        else:
+            animate(path, shots, fps)
         assert trajectory.reward is not None
         return float(trajectory.reward.sum())
 

@@ -62,7 +62,9 @@ def enjoy_model(
     task: ForTask = "",
     policy: Policy = "wpt",
     seed: Annotated[int, typer.Option(min=0, help="The seed of the initial state.")] = 10_000,
-    out: Annotated[Path, typer.Option(help="The file to write: an .mp4 or a .gif.")] = Path("enjoy.mp4"),
+    out: Annotated[Path, typer.Option(help="The file to write: an .mp4 or a .gif.")] = Path(
+        "enjoy.mp4"
+    ),
     size: Annotated[
         int, typer.Option(min=64, help="The width of the video, a multiple of 16.")
     ] = 256,

@@ -51,14 +51,14 @@ def test_the_strip_shows_true_above_dreamed_images_at_their_steps(film, tmp_path
     assert sum(durations) == 40 * 100 + LAST
     # columns end at 5 + 74 k / 4: 23.5 (rounded to even, 24), 42, 60.5 (60) and 79
     for column, end in enumerate((24, 42, 60, 79)):
-        assert abs(tile(pictures[-1], column, 0) - (shade(end), 0, 0)).max() <= 8
-        assert abs(tile(pictures[-1], column, 1) - (0, shade(end), 0)).max() <= 8
+        assert abs(tile(pictures[-1], column, 0) - (shade(end), 0, 0)).max() <= 3
+        assert abs(tile(pictures[-1], column, 1) - (0, shade(end), 0)).max() <= 3
     # step 30 is shown after 1.5 s: the first column has ended, the second plays, the third waits
     now = pictures[np.searchsorted(np.cumsum(durations), 1500, side="right")]
-    assert abs(tile(now, 0, 0) - (shade(24), 0, 0)).max() <= 8
-    assert abs(tile(now, 1, 1) - (0, shade(30), 0)).max() <= 8
+    assert abs(tile(now, 0, 0) - (shade(24), 0, 0)).max() <= 3
+    assert abs(tile(now, 1, 1) - (0, shade(30), 0)).max() <= 3
     assert tile(now, 2, 0).min() > 250
-    assert abs(now[BAND + 5, GAP + 5].astype(int) - (0, 0, shade(30))).max() <= 8
+    assert abs(now[BAND + 5, GAP + 5].astype(int) - (0, 0, shade(30))).max() <= 3
 
 
 def test_without_a_world_model_it_is_the_film_alone(film, tmp_path):

@@ -43,8 +43,7 @@ def animate(
         assert true.shape == dreamed.shape, (true.shape, dreamed.shape)
         pictures = _compose(shots, steps, true, dreamed, context)
     # One palette for all pictures, so that what does not move does not flicker.
-    tile = [picture.resize((picture.width // 4, picture.height // 4)) for picture in pictures]
-    samples = np.concatenate([np.asarray(picture) for picture in tile])
+    samples = np.concatenate([np.asarray(picture)[::3, ::3] for picture in pictures])
     palette = Image.fromarray(samples).quantize(COLOURS)
     first, *others = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     shown = round(1000 * SLOWDOWN * stride / fps)  # milliseconds

@@ -363,7 +363,7 @@ def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula():
     with torch.no_grad():
         imagined = learner.imagine(start, torch.arange(6), generator)
     loss = learner.actor_loss(imagined, torch.tensor(2.0))
-    dream, reward, value, returns = imagined
+    dream, reward, value, returns, _ = imagined
     expected = 0.0
     for n in range(6):
         for t in range(dream.action.shape[1] - 1):

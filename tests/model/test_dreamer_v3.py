@@ -83,7 +83,10 @@ def test_the_replay_value_loss_counts_known_rewards_only():
 
 
 def test_the_continue_loss_by_hand():
-    # p(go on) = .8 at both: -(ln .8 + ln .2) / 2
-    logits = torch.full((1, 2), math.log(4.0))
-    loss = continue_loss(logits, bools([False, True]))
+    # p(go on) = .8 at all three, the last of which belongs to another task: -(ln .8 + ln .2) / 2
+    logits = torch.full((1, 3), math.log(4.0), requires_grad=True)
+    loss = continue_loss(logits, bools([False, True, True]), bools([True, True, False]))
     assert loss.item() == pytest.approx(-(math.log(0.8) + math.log(0.2)) / 2)
+    loss.backward()
+    # the slope of -ln sigmoid(x) is sigmoid(x) - 1, that of -ln(1 - sigmoid(x)) is sigmoid(x)
+    torch.testing.assert_close(logits.grad, torch.tensor([[-0.1, 0.4, 0.0]]))

@@ -16,7 +16,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.sizes import SIZES
-from wpt_agents.training import cloning, learner, pretraining
+from wpt_agents.training import cloning, learner, pretraining, world_model_learner
 from wpt_agents.training.hyperparameters import SIZES_OWN, Hyperparameters
 from wpt_agents.zoo.plan.runs import make_plan
 
@@ -213,17 +213,17 @@ def poison(monkeypatch, name, after, module=learner):
 
 
 @pytest.mark.parametrize(
-    ("name", "network"),
+    ("name", "network", "module"),
     [
-        ("reward_loss", "world model"),
-        ("lambda_return", "actor"),
-        ("actor_loss", "actor"),
-        ("critic_loss", "critic"),
+        ("reward_loss", "world model", world_model_learner),
+        ("lambda_return", "actor", learner),
+        ("actor_loss", "actor", learner),
+        ("critic_loss", "critic", learner),
     ],
 )
-def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network, tmp_path):
+def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network, module, tmp_path):
     model = agent(ClockEnv())
-    poison(monkeypatch, name, after=1)
+    poison(monkeypatch, name, after=1, module=module)
     with pytest.raises(FloatingPointError, match=rf"{network} loss is nan.*lower the learning"):
         model.learn(100)
     assert finite(model) and model.updates == 1

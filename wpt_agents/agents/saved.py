@@ -269,8 +269,15 @@ class SavedAgent(KeywordAgent):
         """
         model_files.check_same(header, self.hyperparameters.as_dict(), same)
         progress = self.progress_class.of(header["counters"])
+        self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
         self.progress = progress
+
+    def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
+        """Add or remove the networks that only some models have, before weights are loaded.
+
+        :param weights: by name; none of a file that holds a world model alone
+        """
 
     def set_parameters(
         self,
@@ -280,10 +287,12 @@ class SavedAgent(KeywordAgent):
     ) -> None:
         """Load weights and optimisers in place, from a model file or from `get_parameters`."""
         if isinstance(load_path_or_dict, dict):
+            self.fit_networks(load_path_or_dict.get("policy", {}))
             super().set_parameters(load_path_or_dict, exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         model_files.check_same(header, self.hyperparameters.as_dict(), self.shape_keywords)
+        self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:

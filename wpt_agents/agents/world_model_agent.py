@@ -1,6 +1,8 @@
 """An agent with WPT's networks: how they are made, adapted, kept for other tasks and shown."""
 
+import math
 import os
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Self
 
@@ -9,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.official import export_model, import_model
@@ -82,6 +85,27 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             batch = data.sample(*INITIAL_IMAGES, settings.max_action_dim, rng)
             self.policy.world_model.standardise(batch.image.flatten(0, 1).to(self.device))
         self.progress.initialised = True
+
+    def learn_ends(self) -> None:
+        """Add the continue head once an episode of the task has terminated."""
+        model = self.policy.world_model
+        if not self.hyperparameters.continue_head or model.continue_head is not None:
+            return
+        if ends := sum(episode.terminated for episode in self.replay_buffer.trajectories):
+            odds = len(self.replay_buffer) / ends  # else half of all value were lost at first
+            seed = self.streams.integer(Purpose.CONTINUE, 0)
+            model.make_continue_head(math.log(odds), seed)
+            self.learner.add_continue_head()
+
+    def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
+        """Add or remove the continue head, which only models of tasks that end have."""
+        if not weights:
+            return
+        model = self.policy.world_model
+        model.continue_head = None
+        if any(name.startswith("world_model.continue_head.") for name in weights):
+            model.make_continue_head(0.0, 0)
+        self.learner.add_continue_head()
 
     def operations(self) -> AbstractContextManager[None]:
         """Return the context that the networks compute in, by the keyword `fast`."""

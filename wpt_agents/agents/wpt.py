@@ -254,6 +254,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         settings = self.hyperparameters
         progress = self.progress
         self.adapt_to_data(self.replay_buffer)
+        self.learn_ends()
         batch = mix(
             self.replay_buffer,
             self.retrieved,

@@ -10,17 +10,28 @@ from wpt_agents.model.sizes import Size
 CONTEXT = 3  # images behind a state from which on more of them improve predictions no further
 
 
-def lambda_return(reward: Tensor, value: Tensor, gamma: float = 0.99, lam: float = 0.95) -> Tensor:
+def lambda_return(
+    reward: Tensor,
+    value: Tensor,
+    gamma: float = 0.99,
+    lam: float = 0.95,
+    goes_on: Tensor | None = None,
+) -> Tensor:
     """Eq. (2): V_t = r_t + γ [(1 - λ) v_{t+1} + λ V_{t+1}] and V_H = v_H.
+
+    Where episodes can end, γ is multiplied by the probability c_t that they go on after step t, as
+    in DreamerV3. The paper has no such tasks.
 
     :param reward: (B, H), predicted at the imagined steps 0 .. H-1
     :param value: (B, H + 1), the critic's means at the steps 0 .. H
+    :param goes_on: (B, H), c; 1 everywhere if None
     :return: (B, H), the targets of Eq. (3)
     """
     assert value.shape[1] == reward.shape[1] + 1, (value.shape, reward.shape)
     returns = [value[:, -1]]
     for t in reversed(range(reward.shape[1])):
         bootstrap = (1 - lam) * value[:, t + 1] + lam * returns[-1]
+        bootstrap = bootstrap if goes_on is None else goes_on[:, t] * bootstrap
         returns.append(reward[:, t] + gamma * bootstrap)
     return torch.stack(returns[:0:-1], dim=1)
 
@@ -51,14 +62,18 @@ def draw_starts(
     return (rank < ends.diff()[:, None]).flatten().nonzero().squeeze(1)
 
 
-def critic_loss(logits: Tensor, lambda_return: Tensor, gamma: float = 0.99) -> Tensor:
+def critic_loss(
+    logits: Tensor, lambda_return: Tensor, gamma: float = 0.99, goes_on: Tensor | None = None
+) -> Tensor:
     """Eq. (3): -ln v(V_t | s_t), averaged, step t weighing γ^t.
 
     :param logits: (B, H, bins), of detached states
     :param lambda_return: (B, H); no gradient reaches it
+    :param goes_on: (B, H), c of `lambda_return`: steps that dreams hardly reach weigh less
     """
     assert logits.shape[:2] == lambda_return.shape, (logits.shape, lambda_return.shape)
     weight = discounts(lambda_return.shape[1], gamma, like=lambda_return)
+    weight = weight if goes_on is None else weight * survival(goes_on)
     return (weight * two_hot_loss(logits, lambda_return.detach())).mean()
 
 
@@ -68,6 +83,7 @@ def actor_loss(
     ent_coef: float = 1e-4,
     gamma: float = 0.99,
     return_scale: Tensor | float = 1.0,
+    goes_on: Tensor | None = None,
 ) -> Tensor:
     """Eq. (4): -V_t - η H[a_t | s_t], averaged, step t weighing γ^t.
 
@@ -77,9 +93,10 @@ def actor_loss(
     :param lambda_return: (B, H), with its gradient through the dynamics
     :param entropy: (B, H), of the actor at the steps 0 .. H-1
     :param return_scale: divides the returns; 1 in the paper
+    :param goes_on: (B, H), c of `lambda_return`: an action counts if the episode goes on after it
     """
     assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
-    weight = discounts(entropy.shape[1] - 1, gamma, like=entropy)
+    weight = actor_weight(gamma, entropy, goes_on)
     objective = lambda_return[:, 1:] / return_scale + ent_coef * entropy[:, :-1]
     return -(weight * objective).mean()
 
@@ -87,6 +104,29 @@ def actor_loss(
 def discounts(length: int, gamma: float, like: Tensor) -> Tensor:
     """1, γ, γ², ...: (length,)."""
     return gamma ** torch.arange(length, device=like.device, dtype=torch.float32)
+
+
+def survival(goes_on: Tensor) -> Tensor:
+    """Π_{k<t} c_k: the probability that a dream has not ended before step t.
+
+    :param goes_on: (B, H), c of the steps 0 .. H-1; no gradient reaches it
+    :return: (B, H), 1 at step 0
+    """
+    products = goes_on.detach()[:, :-1].cumprod(1)
+    return torch.cat([torch.ones_like(goes_on[:, :1]), products], 1)
+
+
+def actor_weight(gamma: float, like: Tensor, goes_on: Tensor | None = None) -> Tensor:
+    """Return the weights of the actions at the steps 0 .. H-2: γ^t Π_{k<=t} c_k.
+
+    An action at a step that ends the episode leads nowhere, so c_t is a factor of its own weight.
+
+    :param like: (B, H), for device and length
+    :param goes_on: (B, H), c; 1 everywhere if None
+    :return: (H - 1,) or (B, H - 1)
+    """
+    weight = discounts(like.shape[1] - 1, gamma, like)
+    return weight if goes_on is None else weight * survival(goes_on)[:, 1:]
 
 
 def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -> Tensor:

@@ -22,7 +22,7 @@ def advantage(
     :param reward: (N, H), on arriving at the imagined steps 0 .. H-1
     :param value: (N, H + 1), the critic's means at the steps 0 .. H
     :param lambda_return: (N, H), V of Eq. (2)
-    :param discount: γ, or (N, H) γ times the probability that the episode goes on at step t + 1
+    :param discount: γ, or (N, H) γ times the probability that the episode goes on after step t
     :return: (N, H - 1), of the actions at the steps 0 .. H-2; no gradient runs through it
     """
     if isinstance(discount, Tensor):
@@ -91,10 +91,13 @@ def replay_value_loss(logits: Tensor, replay_return: Tensor, known: Tensor) -> T
     return (loss * known).sum() / known.sum().clamp_min(1)
 
 
-def continue_loss(logits: Tensor, is_terminal: Tensor) -> Tensor:
+def continue_loss(logits: Tensor, is_terminal: Tensor, known: Tensor) -> Tensor:
     """-ln p(c_t | s_t) of a Bernoulli: whether the episode goes on after this state.
 
     :param logits: (B, T), of going on, on detached features
     :param is_terminal: (B, T) bool
+    :param known: (B, T) bool, the steps of the task; other tasks may end elsewhere
     """
-    return F.binary_cross_entropy_with_logits(logits.float(), (~is_terminal).float())
+    goes_on = (~is_terminal).float()
+    loss = F.binary_cross_entropy_with_logits(logits.float(), goes_on, reduction="none")
+    return (loss * known).sum() / known.sum().clamp_min(1)

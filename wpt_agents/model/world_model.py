@@ -89,7 +89,9 @@ def reward_loss(logits: Tensor, reward: Tensor, known: Tensor) -> Tensor:
 
 
 class WorldModel(nn.Module):
-    """Encoder, RSSM, decoder, and the reward head, which only fine-tuning trains.
+    """Encoder, RSSM, decoder, and the heads of a task, which only fine-tuning trains.
+
+    `continue_head` is None unless episodes of the task can end.
 
     :param size: the widths
     :param action_dim: the padded action width
@@ -109,8 +111,21 @@ class WorldModel(nn.Module):
         self.reset_reward_head()
 
     def reset_reward_head(self) -> None:
-        """Draw new weights for the reward head: rewards belong to a task, the rest does not."""
+        """Draw new weights for what belongs to a task: rewards do, and where episodes end."""
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
+        self.continue_head: Head | None = None
+
+    def make_continue_head(self, log_odds: float, seed: int) -> None:
+        """Add DreamerV3's continue head, which predicts whether the episode goes on after a state.
+
+        :param log_odds: of going on, before anything is learned
+        :param seed: of its own random numbers, so that no other network changes
+        """
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            head = Head(self.size, 2, 1, zero_init=True)
+        nn.init.constant_(head.layers[-1].get_parameter("bias"), log_odds)
+        self.continue_head = head.to(self.rssm.post_in.weight.device)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
         """Return theta: the parameters of everything but the reward head."""
@@ -144,6 +159,15 @@ class WorldModel(nn.Module):
     def reward(self, feat: Tensor) -> Tensor:
         """Predict the reward for arriving in a state: (..., D + S*K) -> (...)."""
         return two_hot_mean(self.reward_head(feat))
+
+    def goes_on(self, feat: Tensor) -> Tensor:
+        """Predict the probability that the episode goes on after a state: (..., D + S*K) -> (...).
+
+        It needs the continue head.
+        """
+        assert self.continue_head is not None
+        logits: Tensor = self.continue_head(feat)
+        return logits.float().squeeze(-1).sigmoid()
 
     @torch.no_grad()
     def open_loop(self, batch: Batch, context: int, generator: Noise = None) -> Tensor:

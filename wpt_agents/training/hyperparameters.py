@@ -176,6 +176,12 @@ class Hyperparameters(Keywords):
         "the paper",
     )
 
+    continue_head: bool = switch(
+        True,
+        "once an episode of the task has terminated, learn where episodes end, and let imagined "
+        "returns end there, as in DreamerV3. No task of the paper terminates",
+    )
+
     # Collecting.
     learning_starts: int = count(
         5_000,

@@ -1,18 +1,15 @@
 """// Update Models of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
 
-from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from torch import Generator, Tensor, nn
-from torch.optim import Optimizer
+from torch import Generator, Tensor
 
-import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
     actor_loss,
+    actor_weight,
     critic_loss,
-    discounts,
     draw_starts,
     ema_update,
     lambda_return,
@@ -28,11 +25,9 @@ from wpt_agents.model.dreamer_v3 import (
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
-from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
-from wpt_agents.training import descent
 from wpt_agents.training.hyperparameters import Hyperparameters
-
-Metrics = dict[str, Tensor]  # scalars without gradient, by their names in the log
+from wpt_agents.training.world_model_learner import Metrics as Metrics
+from wpt_agents.training.world_model_learner import WorldModelLearner
 
 
 class Imagined(NamedTuple):
@@ -42,9 +37,10 @@ class Imagined(NamedTuple):
     reward: Tensor  # (N, H)
     value: Tensor  # (N, H + 1), of the target critic
     returns: Tensor  # (N, H), Eq. (2)
+    goes_on: Tensor | None = None  # (N, H), the probability that the episode goes on after a step
 
 
-class Learner:
+class Learner(WorldModelLearner):
     """The optimisers of a policy's networks, and the updates that they make.
 
     Example::
@@ -57,24 +53,14 @@ class Learner:
     """
 
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
-        self.policy = policy
-        self.hyperparameters = hyperparameters.resolved()
-        model = policy.world_model
-        rate = float(self.hyperparameters.value("learning_rate"))
-        actor_critic_rate = self.hyperparameters.value("actor_critic_learning_rate")
-        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
-        self.model_optimizer = self.adam(parts, rate)
-        self.actor_optimizer = self.adam([list(policy.actor.parameters())], actor_critic_rate)
-        self.critic_optimizer = self.adam([list(policy.critic.parameters())], actor_critic_rate)
-
-    def adam(self, parts: list[list[nn.Parameter]], rate: float) -> Optimizer:
-        """Make an optimiser over parts whose gradients are clipped separately."""
-        return descent.adam(parts, rate, self.hyperparameters.weight_decay)
+        super().__init__(policy, hyperparameters)
+        rate = self.hyperparameters.value("actor_critic_learning_rate")
+        self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
+        self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
-        self.hyperparameters = hyperparameters.resolved()
-        self.set_rate(self.model_optimizer, float(self.hyperparameters.value("learning_rate")))
+        super().configure(hyperparameters)
         self.set_actor_critic_rate(1.0)
 
     def set_actor_critic_rate(self, share: float) -> None:
@@ -82,12 +68,6 @@ class Learner:
         rate = share * self.hyperparameters.value("actor_critic_learning_rate")
         self.set_rate(self.actor_optimizer, rate)
         self.set_rate(self.critic_optimizer, rate)
-
-    def set_rate(self, optimizer: Optimizer, rate: float) -> None:
-        """Set an optimiser's learning rate and weight decay."""
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-            group["weight_decay"] = descent.decay(rate, self.hyperparameters.weight_decay)
 
     def update(
         self,
@@ -102,6 +82,7 @@ class Learner:
         :param head_start: train the actor on nothing but that imitation
         """
         post, metrics = self.update_world_model(batch, generator, learn_reward=True)
+        metrics |= self.update_continue_head(post, batch)
         imitation = None
         if imitation_weight:
             loss = self.imitation_loss(post, batch)
@@ -116,32 +97,6 @@ class Learner:
             grounding = self.hyperparameters.repval_scale * loss
         metrics |= self.update_behavior(start, starts, generator, imitation, head_start, grounding)
         return metrics
-
-    def update_world_model(
-        self, batch: Batch, generator: Generator, learn_reward: bool = False
-    ) -> tuple[Latent, Metrics]:
-        """Take a step on Eq. (1), and on the reward likelihood of states that it leaves alone.
-
-        :return: the posterior states (B, T, ...), without gradient
-        """
-        model = self.policy.world_model
-        metrics: Metrics = {}
-        with self.autocast():
-            loss, post = world_model_update_loss(model, batch, generator, **self.eq_1_options)
-            total = loss.total
-            if learn_reward:
-                logits = model.reward_head(post.feat.detach())
-                reward = reward_loss(logits, batch.reward, batch.reward_known)
-                total = total + reward
-                metrics["train/reward_loss"] = reward.detach()
-        norm = self.descend(self.model_optimizer, total, "world model")
-        return post.detach(), metrics | world_model_metrics(loss, norm)
-
-    @property
-    def eq_1_options(self) -> dict[str, Any]:
-        """The keywords of `world_model_loss`."""
-        names = ("dyn_scale", "rep_scale", "free_nats", "free_nats_mode")
-        return {name: getattr(self.hyperparameters, name) for name in names}
 
     def imitation_loss(self, post: Latent, batch: Batch) -> Tensor:
         """Kickstarting: how far the actor is from the prior actor on the replayed images.
@@ -205,7 +160,7 @@ class Learner:
         with self.autocast():
             with torch.set_grad_enabled(through_dream):
                 imagined = self.imagine(start, starts, generator)
-            dream, reward, value, returns = imagined
+            dream, reward, value, returns, goes_on = imagined
             spread, scale = self.return_scale(returns)
             loss = self.actor_loss(imagined, scale)
         terms = [] if head_start else [loss]
@@ -216,7 +171,7 @@ class Learner:
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
-            value_loss = critic_loss(logits, returns, settings.gamma)
+            value_loss = critic_loss(logits, returns, settings.gamma, goes_on)
         total = value_loss if grounding is None else value_loss + grounding
         critic_norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
@@ -239,8 +194,9 @@ class Learner:
         dream = self.policy.dream(start, settings.imagine_horizon, generator)
         reward = self.imagined_reward(dream, starts)
         value = over_steps(self.policy.target_critic.value, dream.states)
-        returns = lambda_return(reward, value, settings.gamma, settings.lam)
-        return Imagined(dream, reward, value, returns)
+        goes_on = self.imagined_continue(dream)
+        returns = lambda_return(reward, value, settings.gamma, settings.lam, goes_on)
+        return Imagined(dream, reward, value, returns, goes_on)
 
     def actor_loss(self, imagined: Imagined, scale: Tensor) -> Tensor:
         """Compute Eq. (4), or DreamerV3's REINFORCE on the actions of the dreams.
@@ -248,17 +204,17 @@ class Learner:
         :param scale: what returns are divided by
         """
         settings = self.hyperparameters
-        dream, reward, value, returns = imagined
+        dream, reward, value, returns, goes_on = imagined
+        gamma = settings.gamma
         if settings.actor_grad == "dynamics":
-            return actor_loss(returns, dream.entropy, settings.ent_coef, settings.gamma, scale)
+            return actor_loss(returns, dream.entropy, settings.ent_coef, gamma, scale, goes_on)
         feat = dream.states.but_last().but_last().feat.detach()
         dist = self.policy.actor.dist(feat, self.policy.action_mask)
-        weight = discounts(feat.shape[1], settings.gamma, like=returns)
         return reinforce_loss(
             dist.log_prob(dream.action[:, :-1].detach()),
-            advantage(reward, value, returns, settings.gamma),
+            advantage(reward, value, returns, gamma if goes_on is None else gamma * goes_on),
             dist.entropy(),
-            weight,
+            actor_weight(gamma, returns, goes_on),
             settings.ent_coef,
             scale,
         )
@@ -272,6 +228,14 @@ class Learner:
         with frozen(model):
             return over_steps(model.reward, dream.states.but_last())
 
+    def imagined_continue(self, dream: Dream) -> Tensor | None:
+        """Return the probability of going on after the steps 0 .. H-1, (N, H); None if certain."""
+        model = self.policy.world_model
+        if model.continue_head is None:
+            return None
+        with frozen(model):
+            return over_steps(model.goes_on, dream.states.but_last())
+
     def return_scale(self, returns: Tensor) -> tuple[Tensor, Tensor]:
         """Return the running 5-95 % range of the returns, and what they are divided by."""
         before = self.policy.return_scale
@@ -281,30 +245,3 @@ class Learner:
         unknown = before == 0  # these are the first returns
         spread = torch.where(unknown, width, before.lerp(width, 0.01))
         return spread, spread.clamp_min(1.0)
-
-    def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
-        """Take a step on a loss; return the gradient's norm before clipping."""
-        norm = descent.descend(optimizer, loss, name, self.hyperparameters.grad_clip)
-        self.policy.updates += 1  # cached copies of the weights are out of date
-        return norm
-
-    def take_step(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
-        """Take a step on gradients that were computed; return their norm before clipping."""
-        norm = descent.take_step(optimizer, loss, name, self.hyperparameters.grad_clip)
-        self.policy.updates += 1
-        return norm
-
-    def autocast(self) -> AbstractContextManager[None]:
-        """Return the context of a forward pass, by the keyword `precision`."""
-        bf16 = self.hyperparameters.precision == "bf16"
-        kind = self.policy.device.type
-        return torch.autocast(kind, torch.bfloat16, enabled=bf16, cache_enabled=True)
-
-
-def world_model_metrics(loss: WorldModelLoss, norm: Tensor) -> Metrics:
-    """Return the metrics of a step on Eq. (1)."""
-    return {
-        "train/reconstruction_loss": loss.reconstruction.detach(),
-        "train/kl": loss.kl,
-        "train/world_model_grad_norm": norm,
-    }

@@ -9,8 +9,12 @@ from tqdm.auto import tqdm
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.training.distributed import Divided, World
-from wpt_agents.training.learner import Learner, Metrics, world_model_metrics
 from wpt_agents.training.randomness import Purpose, Streams, torch_seed
+from wpt_agents.training.world_model_learner import (
+    Metrics,
+    WorldModelLearner,
+    world_model_metrics,
+)
 
 EVERY = 1000  # updates between two model files
 
@@ -18,7 +22,7 @@ Update = Callable[[Batch, int], Metrics]  # called with a batch and the update's
 
 
 def world_model_updates(
-    learner: Learner,
+    learner: WorldModelLearner,
     dataset: TrajectoryDataset,
     streams: Streams,
     world: World,
@@ -63,7 +67,7 @@ def world_model_updates(
             bar.update()
 
 
-def whole_update(learner: Learner, streams: Streams) -> Update:
+def whole_update(learner: WorldModelLearner, streams: Streams) -> Update:
     """Return an update on a whole batch."""
     device = learner.policy.device
 
@@ -74,7 +78,9 @@ def whole_update(learner: Learner, streams: Streams) -> Update:
     return update
 
 
-def divided_update(learner: Learner, streams: Streams, world: World, accumulate: int) -> Update:
+def divided_update(
+    learner: WorldModelLearner, streams: Streams, world: World, accumulate: int
+) -> Update:
     """Return an update on this process's share of a batch, in several passes."""
     settings = learner.hyperparameters
     divided = Divided(

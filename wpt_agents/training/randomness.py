@@ -26,6 +26,7 @@ class Purpose(IntEnum):
     RETRIEVE = 6
     INITIALISE = 7
     REDRAW = 8  # of the networks, for the next task of a sequence
+    CONTINUE = 9  # the continue head
     RESET = 100  # of the environment, before an explorer's episode
 
 

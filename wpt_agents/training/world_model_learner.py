@@ -1,0 +1,127 @@
+"""The updates of the world model and the heads of a task: Eq. (1) and the reward likelihood."""
+
+from contextlib import AbstractContextManager
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.optim import Optimizer
+
+import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
+from wpt_agents.data.trajectory import Batch
+from wpt_agents.model.dreamer_v3 import continue_loss
+from wpt_agents.model.policy import WPTPolicy
+from wpt_agents.model.rssm import Latent
+from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
+from wpt_agents.training import descent
+from wpt_agents.training.hyperparameters import Hyperparameters
+
+Metrics = dict[str, Tensor]  # scalars without gradient, by their names in the log
+
+
+class WorldModelLearner:
+    """The optimisers of a world model and of its heads, and the updates that they make.
+
+    :param policy: whose world model learns
+    :param hyperparameters: rates, weights and clips
+    """
+
+    def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
+        self.policy = policy
+        self.hyperparameters = hyperparameters.resolved()
+        model = policy.world_model
+        parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
+        self.model_optimizer = self.adam(parts, self.model_rate)
+        self.add_continue_head()
+
+    @property
+    def model_rate(self) -> float:
+        """The learning rate of the world model and its heads."""
+        return float(self.hyperparameters.value("learning_rate"))
+
+    def add_continue_head(self) -> None:
+        """Make an optimiser of the world model's continue head, if it has one."""
+        self.continue_optimizer: Optimizer | None = None
+        if head := self.policy.world_model.continue_head:
+            self.continue_optimizer = self.adam([list(head.parameters())], self.model_rate)
+
+    def adam(self, parts: list[list[nn.Parameter]], rate: float) -> Optimizer:
+        """Make an optimiser over parts whose gradients are clipped separately."""
+        return descent.adam(parts, rate, self.hyperparameters.weight_decay)
+
+    def configure(self, hyperparameters: Hyperparameters) -> None:
+        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        self.hyperparameters = hyperparameters.resolved()
+        self.set_rate(self.model_optimizer, self.model_rate)
+        if self.continue_optimizer is not None:
+            self.set_rate(self.continue_optimizer, self.model_rate)
+
+    def set_rate(self, optimizer: Optimizer, rate: float) -> None:
+        """Set an optimiser's learning rate and weight decay."""
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+            group["weight_decay"] = descent.decay(rate, self.hyperparameters.weight_decay)
+
+    def update_world_model(
+        self, batch: Batch, generator: Generator, learn_reward: bool = False
+    ) -> tuple[Latent, Metrics]:
+        """Take a step on Eq. (1), and on the reward likelihood of states that it leaves alone.
+
+        :return: the posterior states (B, T, ...), without gradient
+        """
+        model = self.policy.world_model
+        metrics: Metrics = {}
+        with self.autocast():
+            loss, post = world_model_update_loss(model, batch, generator, **self.eq_1_options)
+            total = loss.total
+            if learn_reward:
+                logits = model.reward_head(post.feat.detach())
+                reward = reward_loss(logits, batch.reward, batch.reward_known)
+                total = total + reward
+                metrics["train/reward_loss"] = reward.detach()
+        norm = self.descend(self.model_optimizer, total, "world model")
+        return post.detach(), metrics | world_model_metrics(loss, norm)
+
+    def update_continue_head(self, post: Latent, batch: Batch) -> Metrics:
+        """Take a step on the continue head, if there is one, on the rows of the task itself."""
+        head = self.policy.world_model.continue_head
+        if head is None or self.continue_optimizer is None:
+            return {}
+        known = batch.reward_known.any(1, keepdim=True).expand_as(batch.is_terminal)
+        with self.autocast():
+            loss = continue_loss(head(post.feat).squeeze(-1), batch.is_terminal, known)
+        self.descend(self.continue_optimizer, loss, "continue")
+        return {"train/continue_loss": loss.detach()}
+
+    @property
+    def eq_1_options(self) -> dict[str, Any]:
+        """The keywords of `world_model_loss`."""
+        names = ("dyn_scale", "rep_scale", "free_nats", "free_nats_mode")
+        return {name: getattr(self.hyperparameters, name) for name in names}
+
+    def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """Take a step on a loss; return the gradient's norm before clipping."""
+        norm = descent.descend(optimizer, loss, name, self.hyperparameters.grad_clip)
+        self.policy.updates += 1  # cached copies of the weights are out of date
+        return norm
+
+    def take_step(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:
+        """Take a step on gradients that were computed; return their norm before clipping."""
+        norm = descent.take_step(optimizer, loss, name, self.hyperparameters.grad_clip)
+        self.policy.updates += 1
+        return norm
+
+    def autocast(self) -> AbstractContextManager[None]:
+        """Return the context of a forward pass, by the keyword `precision`."""
+        bf16 = self.hyperparameters.precision == "bf16"
+        kind = self.policy.device.type
+        return torch.autocast(kind, torch.bfloat16, enabled=bf16, cache_enabled=True)
+
+
+def world_model_metrics(loss: WorldModelLoss, norm: Tensor) -> Metrics:
+    """Return the metrics of a step on Eq. (1)."""
+    return {
+        "train/reconstruction_loss": loss.reconstruction.detach(),
+        "train/kl": loss.kl,
+        "train/world_model_grad_norm": norm,
+    }

@@ -18,6 +18,7 @@ from wpt_agents.model.actor_critic import (
     survival,
 )
 from wpt_agents.model.distributions import two_hot_loss
+from wpt_agents.model.rssm import Latent
 
 HEAD = "world_model.continue_head"
 
@@ -134,13 +135,21 @@ def test_at_first_the_head_predicts_the_share_of_steps_that_go_on():
     torch.testing.assert_close(model.policy.world_model.goes_on(feat), torch.full((3,), 8 / 9))
 
 
-def test_the_head_learns_which_images_are_the_last():
-    model = ending(learning_rate=3e-3)
-    metrics = defaultdict(list)
-    for _ in range(150):
-        model.update(metrics)
-    losses = torch.stack(metrics["train/continue_loss"])
-    assert losses[-10:].mean() < 0.5 * losses[:10].mean()
+def test_the_head_learns_where_the_task_ends_and_not_where_others_do():
+    model = agent(learning_rate=1e-2)
+    model.replay_buffer.add(recorded(length=7, reward=np.zeros(7), terminated=True))
+    model.learn_ends()
+    batch = model.replay_buffer.sample(2, 8, 4, np.random.default_rng(0))
+    batch.is_terminal[1] = ~batch.is_terminal[0]  # another task's row, which ends elsewhere
+    batch.reward_known[1] = False
+    generator = torch.Generator().manual_seed(0)
+    latent = model.policy.world_model.rssm.initial(8)
+    deter = torch.randn(latent.deter.shape, generator=generator)
+    post = Latent(*(x.expand(2, *x.shape) for x in (deter, latent.stoch)))  # equal in both rows
+    for _ in range(60):
+        model.learner.update_continue_head(post, batch)
+    goes_on = model.policy.world_model.goes_on(post.feat)[0]
+    assert goes_on[-1] < 0.2 and goes_on[:-1].min() > 0.8
 
 
 def test_a_model_that_was_saved_with_the_head_learns_on_exactly(tmp_path):

@@ -27,7 +27,7 @@ from wpt_agents.agents import wpt
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.retrieval import Retriever
-from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.trajectory import MarkedBatch, Trajectory
 from wpt_agents.model.observations import stack_frames
 from wpt_agents.model.ops import definitions
 from wpt_agents.model.prior_policy import prior_action
@@ -114,6 +114,26 @@ def test_pretraining_prepares_batches_ahead_and_draws_them_by_seed_and_step(stor
         drawn = store.sample(*shape, rng=model.streams.numpy(Purpose.PRETRAIN, step))
         assert batch.image.equal(drawn.image) and batch.action.equal(drawn.action)
     assert len(seen) == 3
+
+
+def test_marked_pixels_weigh_more_in_pretraining_and_in_fine_tuning(store, monkeypatch):
+    seen, update = [], Learner.update_world_model
+
+    def watch(self, batch, *rest, **options):
+        seen.append(batch)
+        return update(self, batch, *rest, **options)
+
+    monkeypatch.setattr(Learner, "update_world_model", watch)
+    plain, weighted = (pretrained(store, steps=2, pixel_weight=w) for w in (1.0, 8.0))
+    assert [isinstance(batch, MarkedBatch) for batch in seen] == [False, False, True, True]
+    assert not same(weights(plain), weights(weighted))
+    in_passes = pretrained(store, steps=2, pixel_weight=8.0, accumulate=2)
+    for ours, theirs in zip(weights(in_passes).values(), weights(weighted).values(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
+    del seen[:]
+    weighted.set_env(DotEnv())
+    weighted.learn(2 * LENGTH)
+    assert seen and all(isinstance(batch, MarkedBatch) for batch in seen)
 
 
 def test_pretraining_shows_the_time_left(store, capfd):

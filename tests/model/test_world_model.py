@@ -7,15 +7,17 @@ import pytest
 import torch
 
 from wpt_agents.data.replay import ReplayBuffer
-from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
+from wpt_agents.data.trajectory import MarkedBatch, Trajectory, led_to, stack_windows
 from wpt_agents.model.actor_critic import Actor, Critic
 from wpt_agents.model.behavior_cloning import PriorActor
 from wpt_agents.model.distributions import symexp
 from wpt_agents.model.images import to_unit
+from wpt_agents.model.ops import definitions
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.model.world_model import (
     WorldModel,
+    pixel_weights,
     reward_loss,
     squared_error,
     world_model_loss,
@@ -99,6 +101,48 @@ def test_the_reconstruction_error_in_pieces_is_that_of_all_images(monkeypatch):
     assert expected.shape == batch.image.shape[:2]
     monkeypatch.setattr("wpt_agents.fast.pieces.PIECE", 2 * model.decoder.row_size)  # 2 + 2 + 2 + 1
     torch.testing.assert_close(model.reconstruction_error(post, batch.image), expected)
+
+
+def test_a_pixel_that_weighs_more_has_a_smaller_variance_by_hand():
+    image, reconstruction = torch.zeros(1, 2, 1, 3), torch.zeros(1, 2, 1, 3).requires_grad_()
+    with torch.no_grad():
+        reconstruction += torch.tensor([0.1, 0.2]).view(1, 2, 1, 1)
+    weight = pixel_weights(torch.tensor([[[False], [True]]]), 5.0)
+    # three colours each: 3 * .01 + 5 * 3 * .04
+    error = squared_error(image, reconstruction, weight[..., None])
+    assert error.item() == pytest.approx(0.63)
+    error.backward()
+    # d/dx w (x - 0)^2 = 2 w x: .2 and 2 * 5 * .2
+    slopes = reconstruction.grad[0, :, 0, 0]
+    torch.testing.assert_close(slopes, torch.tensor([0.2, 2.0]))
+    plain = squared_error(image, reconstruction)
+    assert torch.equal(squared_error(image, reconstruction, torch.ones(1)), plain)
+
+
+@pytest.mark.parametrize("piece", [None, 2])
+def test_marked_pixels_weigh_more_in_the_fast_twin_as_in_the_definition(monkeypatch, piece):
+    model, batch = WorldModel(DEBUG, WIDTH), windows(turn(6))
+    if piece:
+        monkeypatch.setattr("wpt_agents.fast.pieces.PIECE", piece * model.decoder.row_size)
+    moving = torch.rand(batch.image.shape[:-1], generator=seeded()) < 0.3
+    marked = MarkedBatch(**vars(batch), moving=moving)
+    post, _, _ = model.observe(batch, seeded())
+    weight = 1 + 7 * moving[..., None]
+    expected = (weight * (to_unit(batch.image) - model.decode(post)).square()).sum((-3, -2, -1))
+    with definitions():
+        defined = model.batch_error(post, marked, 8.0)
+    torch.testing.assert_close(defined, expected)
+    fast = model.batch_error(post, marked, 8.0)
+    torch.testing.assert_close(fast, expected)
+    # gradients, of all weights of the decoder
+    slopes = [
+        torch.autograd.grad(e.sum(), list(model.decoder.parameters()), retain_graph=True)
+        for e in (fast, expected)
+    ]
+    for ours, theirs in zip(*slopes, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-3 * theirs.abs().max().item())
+    # a batch without marks is the paper's, whatever the weight
+    assert torch.equal(model.batch_error(post, batch, 8.0), model.batch_error(post, batch))
 
 
 def test_only_the_reconstruction_reaches_the_decoder():

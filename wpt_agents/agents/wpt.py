@@ -264,6 +264,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             settings.max_action_dim,
             self.streams.numpy(Purpose.UPDATE, progress.updates),
             settings.recent_share,
+            settings.marks,
         ).to(self.device)
         if settings.actor_critic_decay:
             left = 1 - self.num_timesteps / max(self._total_timesteps, 1)

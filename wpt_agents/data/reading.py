@@ -42,6 +42,7 @@ class StoredTrajectories:
         self._ids = ids
         self._whole: object = None  # what a view must keep alive: a temporary folder's dataset
         self._windows: Windows | None = None
+        self._backgrounds: dict[object, np.ndarray] = {}  # 12 kB for each trajectory seen
         self._threads = Threads(workers)
 
     def __len__(self) -> int:
@@ -159,12 +160,14 @@ class StoredTrajectories:
         action_width: int | None = None,
         rng: np.random.Generator | None = None,
         share: slice = slice(None),
+        mark: bool = False,
     ) -> Batch:
         """Draw sequences by the rule of `wpt_agents.data.windows`; `rng` alone decides which.
 
         :param action_width: the width of the batch's actions; `max_action_dim` by default
         :param rng: other sequences at every call by default
         :param share: the rows that are read, for one of several processes
+        :param mark: return a `MarkedBatch`; it reads each trajectory once as a whole
         :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
             `action_width`
         """
@@ -176,7 +179,14 @@ class StoredTrajectories:
         rows = self._windows.draw(batch_size, length, rng or np.random.default_rng())[share]
         action_width = self.max_action_dim if action_width is None else action_width
         shape = (self.image_size, self.image_size, 3)
-        return make_batch(rows, self._read, shape, action_width, self._threads.map)
+        background = self._background if mark else None
+        return make_batch(rows, self._read, shape, action_width, self._threads.map, background)
+
+    def _background(self, i: int) -> np.ndarray:
+        key = self._folder(i), self._entries[i].place  # numbers change when some are set aside
+        if key not in self._backgrounds:
+            self._backgrounds[key] = self[i].background
+        return self._backgrounds[key]
 
     def batches(
         self,
@@ -189,6 +199,7 @@ class StoredTrajectories:
         ahead: int = 2,
         pin: bool = False,
         share: slice = slice(None),
+        mark: bool = False,
     ) -> Generator[Batch, None, None]:
         """Yield batches without end; batch k is a function of (seed, purpose, k) alone.
 
@@ -197,11 +208,12 @@ class StoredTrajectories:
         :param ahead: how many are prepared in the background
         :param pin: put them into pinned memory, from which a GPU copies while it computes
         :param share: the rows of each batch that are read, for one of several processes
+        :param mark: make batches that mark what moves, `MarkedBatch`
         """
 
         def draw(k: int) -> Batch:
             rng = np.random.default_rng([seed, purpose, k])
-            batch = self.sample(batch_size, length, action_width, rng, share)
+            batch = self.sample(batch_size, length, action_width, rng, share, mark)
             return batch.pin() if pin else batch
 
         return prefetched(draw, start, ahead)

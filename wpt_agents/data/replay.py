@@ -109,6 +109,7 @@ def mix(
     action_width: int,
     rng: np.random.Generator,
     recent_share: float = 0.0,
+    mark: bool = False,
 ) -> Batch:
     """Experience rehearsal: a batch of `online`, then `batch_size * ratio` rows of `retrieved`.
 
@@ -116,6 +117,7 @@ def mix(
 
     :param recent_share: share of the online rows that come from the newest episodes, which uniform
         replay shows least often
+    :param mark: return a `MarkedBatch`, which marks what moves
     """
     if not 0 <= ratio <= 1:
         raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")
@@ -130,15 +132,21 @@ def mix(
         trajectories = trajectories + retrieved.trajectories
         drawn = retrieved.draw(others, length, rng)
         rows += [[(behind + i, start, stop) for i, start, stop in row] for row in drawn]
-    batch = _batch_of(trajectories, rows, action_width)
+    batch = _batch_of(trajectories, rows, action_width, mark)
     batch.reward[batch_size - others :] = 0
     batch.reward_known[batch_size - others :] = False
     return batch
 
 
-def _batch_of(trajectories: list[Trajectory], rows: list[Row], width: int) -> Batch:
+def _batch_of(
+    trajectories: list[Trajectory], rows: list[Row], width: int, mark: bool = False
+) -> Batch:
     def read(piece: Piece) -> tuple[Trajectory, int, int]:
         i, start, stop = piece
         return trajectories[i], start, stop
 
-    return make_batch(rows, read, trajectories[0].image.shape[1:], width)
+    def background(i: int) -> np.ndarray:
+        return trajectories[i].background
+
+    shape = trajectories[0].image.shape[1:]
+    return make_batch(rows, read, shape, width, background=background if mark else None)

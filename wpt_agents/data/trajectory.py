@@ -16,13 +16,16 @@ A batch pairs each image with what *led to* it, because h_t = f(h_{t-1}, z_{t-1}
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
 IMAGE_SIZE = 64
+GLANCES = 51  # images of a trajectory that its background is the median of
+MOVED = 20  # grey levels of 255 by which a pixel that moves differs from the background
 TOLERANCE = 1e-5  # by which an action may overstep a limit, from rounding
 STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
 
@@ -93,6 +96,12 @@ class Trajectory:
         """The number of actions, T."""
         return len(self.action)
 
+    @cached_property
+    def background(self) -> np.ndarray:
+        """The median image, (H, W, 3) uint8, computed once, of 51 images evenly spaced."""
+        times = np.linspace(0, len(self.image) - 1, min(GLANCES, len(self.image))).round()
+        return np.median(self.image[times.astype(int)], 0).astype(np.uint8)
+
     def __repr__(self) -> str:
         """A summary without the pixels."""
         names = f"embodiment={self.embodiment!r}, task={self.task!r}"
@@ -150,8 +159,9 @@ class Batch:
     def to(self, device: torch.device | str) -> "Batch":
         """The same batch on `device`; a copy from pinned memory runs beside the computation."""
         pinned = self.image.is_pinned()
-        return Batch(
-            **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)}
+        return replace(
+            self,
+            **{f.name: getattr(self, f.name).to(device, non_blocking=pinned) for f in fields(self)},
         )
 
     def split(self, parts: int) -> list["Batch"]:
@@ -159,11 +169,35 @@ class Batch:
         rows, left = divmod(len(self.image), parts)
         assert left == 0, (len(self.image), parts)
         streams = {f.name: getattr(self, f.name).split(rows) for f in fields(self)}
-        return [Batch(**{k: each[i] for k, each in streams.items()}) for i in range(parts)]
+        rows_of = [{name: each[i] for name, each in streams.items()} for i in range(parts)]
+        return [replace(self, **row) for row in rows_of]
 
     def pin(self) -> "Batch":
         """The same batch in pinned memory."""
-        return Batch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+        return replace(self, **{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class MarkedBatch(Batch):
+    """A batch that marks what moves: the pixels that differ from their trajectory's background.
+
+    :param moving: (B, T, 64, 64) bool
+    """
+
+    moving: Tensor
+
+
+def moving_pixels(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Return where images differ from a background by more than 20 of 255 in some colour.
+
+    :param image: (..., H, W, 3) uint8
+    :param background: (H, W, 3) uint8
+    :return: (..., H, W) bool
+    """
+    difference = np.maximum(image, background) - np.minimum(image, background)
+    moved = difference > MOVED
+    red, green, blue = (moved[..., i] for i in range(3))
+    return np.asarray(red | green | blue)
 
 
 def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[str, np.ndarray]:

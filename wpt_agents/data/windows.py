@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from wpt_agents.data.trajectory import Batch, Trajectory, led_to
+from wpt_agents.data.trajectory import Batch, MarkedBatch, Trajectory, led_to, moving_pixels
 
 Piece = tuple[int, int, int]  # trajectory, its first image, one past its last image
 Row = list[Piece]  # the pieces that make one sequence
@@ -60,6 +60,7 @@ def make_batch(
     image_shape: tuple[int, ...],
     width: int,
     each: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
+    background: Callable[[int], np.ndarray] | None = None,
 ) -> Batch:
     """Copy the pieces of each row, one after the other, into a new Batch.
 
@@ -67,10 +68,13 @@ def make_batch(
     :param image_shape: (H, W, 3)
     :param width: the agent's action width, `max_action_dim`
     :param each: `map`, or a thread pool's if `read` takes time
+    :param background: of a trajectory's number, (H, W, 3) uint8; with it, a `MarkedBatch` is made
     :raises ValueError: a trajectory with more actions than `width`
     """
     length = sum(stop - start for _, start, stop in rows[0])
     out = _empty(len(rows), length, image_shape, width)
+    if background is not None:
+        out["moving"] = np.empty((len(rows), length, *image_shape[:2]), bool)
 
     def fill(b: int) -> None:
         at = 0
@@ -79,11 +83,15 @@ def make_batch(
             _check_width(trajectory, width)
             for name, stream in led_to(trajectory, start, stop, width).items():
                 out[name][b, at : at + stop - start] = stream
+            if background is not None:
+                seen = out["image"][b, at : at + stop - start]
+                out["moving"][b, at : at + stop - start] = moving_pixels(seen, background(piece[0]))
             at += stop - start
 
     for _ in each(fill, range(len(rows))):
         pass
-    return Batch(**{name: torch.from_numpy(array) for name, array in out.items()})
+    kind = Batch if background is None else MarkedBatch
+    return kind(**{name: torch.from_numpy(array) for name, array in out.items()})
 
 
 def _empty(

@@ -17,7 +17,7 @@ from wpt_agents.model.images import Decoder, to_unit
 from wpt_agents.model.layers import UpConv
 from wpt_agents.model.ops import down_conv, linear, over_rows, up_conv
 from wpt_agents.model.rssm import Latent
-from wpt_agents.model.world_model import reconstruction_error, squared_error
+from wpt_agents.model.world_model import pixel_weights, reconstruction_error, squared_error
 
 # ------------------------------------------------------------------------------ down
 
@@ -133,7 +133,13 @@ def by_parity(image: Tensor) -> Tensor:
 
 
 @reconstruction_error.faster(when=always)
-def reconstruction_error_by_parity(decoder: Decoder, latent: Latent, image: Tensor) -> Tensor:
+def reconstruction_error_by_parity(
+    decoder: Decoder,
+    latent: Latent,
+    image: Tensor,
+    moving: Tensor | None = None,
+    pixel_weight: float = 1.0,
+) -> Tensor:
     """`reconstruction_error` with the true pixels in the order of the last layer's `phases`.
 
     The decoded pixels are never put into the order of an image: the true ones, which are bytes and
@@ -141,11 +147,16 @@ def reconstruction_error_by_parity(decoder: Decoder, latent: Latent, image: Tens
     error piece by piece, so that neither the true nor the decoded images are all in memory at once.
     """
 
-    def error(image: Tensor, code: Tensor) -> Tensor:
-        return squared_error(to_unit(by_parity(image)), decoded_parities(decoder, code))
+    def error(image: Tensor, code: Tensor, *moving: Tensor) -> Tensor:
+        weight = None
+        if moving:  # each pixel's three colours are side by side
+            marks = by_parity(moving[0][..., None]).repeat_interleave(image.shape[-1], -1)
+            weight = pixel_weights(marks, pixel_weight)
+        return squared_error(to_unit(by_parity(image)), decoded_parities(decoder, code), weight)
 
     code = decoder.code(latent.deter, latent.stoch)
-    return over_rows(error, decoder.row_size, image, code)
+    marks = () if moving is None else (moving,)
+    return over_rows(error, decoder.row_size, image, code, *marks)
 
 
 def decoded_parities(decoder: Decoder, code: Tensor) -> Tensor:

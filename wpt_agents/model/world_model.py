@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from wpt_agents.data.trajectory import Batch
+from wpt_agents.data.trajectory import Batch, MarkedBatch
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.distributions import BINS, Noise, kl_one_hot, two_hot_loss, two_hot_mean
 from wpt_agents.model.images import Decoder, Encoder, to_uint8, to_unit
@@ -24,21 +24,42 @@ class WorldModelLoss(NamedTuple):
     kl: Tensor
 
 
-def squared_error(image: Tensor, reconstruction: Tensor) -> Tensor:
+def squared_error(image: Tensor, reconstruction: Tensor, weight: Tensor | None = None) -> Tensor:
     """-ln p(o_t | z_t, h_t) of a Gaussian with fixed variance, up to constants.
 
     :param image: (..., H, W, C), the true frames in [-0.5, 0.5], their pixels in any order
     :param reconstruction: (..., H, W, C)
+    :param weight: (..., H, W, C) or broadcast to it: a pixel of the weight w has a variance that is
+        w times smaller; 1 in the paper
     :return: (...), summed over a frame
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
-    return F.mse_loss(reconstruction, image, reduction="none").sum((-3, -2, -1))
+    error = F.mse_loss(reconstruction, image, reduction="none")
+    return (error if weight is None else weight * error).sum((-3, -2, -1))
+
+
+def pixel_weights(moving: Tensor, pixel_weight: float) -> Tensor:
+    """Return `pixel_weight` where pixels move and 1 elsewhere: (...) bool -> (...)."""
+    return 1 + (pixel_weight - 1) * moving.float()
 
 
 @op
-def reconstruction_error(decoder: Decoder, latent: Latent, image: Tensor) -> Tensor:
-    """The `squared_error` of N decoded states: (N, ...), (N, 64, 64, 3) uint8 -> (N,)."""
-    return squared_error(to_unit(image), decoder(latent.deter, latent.stoch))
+def reconstruction_error(
+    decoder: Decoder,
+    latent: Latent,
+    image: Tensor,
+    moving: Tensor | None = None,
+    pixel_weight: float = 1.0,
+) -> Tensor:
+    """The `squared_error` of N decoded states.
+
+    :param latent: (N, ...)
+    :param image: (N, 64, 64, 3) uint8
+    :param moving: (N, 64, 64) bool, the pixels that weigh `pixel_weight`
+    :return: (N,)
+    """
+    weight = None if moving is None else pixel_weights(moving[..., None], pixel_weight)
+    return squared_error(to_unit(image), decoder(latent.deter, latent.stoch), weight)
 
 
 def world_model_loss(
@@ -147,14 +168,25 @@ class WorldModel(nn.Module):
         images: Tensor = self.decoder(flat.deter, flat.stoch)
         return images.view(*latent.deter.shape[:2], *images.shape[1:])
 
-    def reconstruction_error(self, latent: Latent, image: Tensor) -> Tensor:
+    def reconstruction_error(
+        self, latent: Latent, image: Tensor, moving: Tensor | None = None, pixel_weight: float = 1.0
+    ) -> Tensor:
         """`squared_error(to_unit(image), self.decode(latent))`, (B, T).
 
         :param latent: (B, T, ...)
         :param image: (B, T, 64, 64, 3) uint8
+        :param moving: (B, T, 64, 64) bool, the pixels that weigh `pixel_weight`
         """
-        error = reconstruction_error(self.decoder, latent.flatten_time(), image.flatten(0, 1))
+        marks = None if moving is None else moving.flatten(0, 1)
+        error = reconstruction_error(
+            self.decoder, latent.flatten_time(), image.flatten(0, 1), marks, pixel_weight
+        )
         return error.view(image.shape[:2])
+
+    def batch_error(self, latent: Latent, batch: Batch, pixel_weight: float = 1.0) -> Tensor:
+        """Return the `reconstruction_error` of states, weighted where a MarkedBatch says so."""
+        moving = batch.moving if isinstance(batch, MarkedBatch) else None
+        return self.reconstruction_error(latent, batch.image, moving, pixel_weight)
 
     def reward(self, feat: Tensor) -> Tensor:
         """Predict the reward for arriving in a state: (..., D + S*K) -> (...)."""
@@ -192,12 +224,17 @@ class WorldModel(nn.Module):
 
 
 def world_model_update_loss(
-    model: WorldModel, batch: Batch, generator: Noise = None, **options: Any
+    model: WorldModel,
+    batch: Batch,
+    generator: Noise = None,
+    pixel_weight: float = 1.0,
+    **options: Any,
 ) -> tuple[WorldModelLoss, Latent]:
     """Return Eq. (1) on a batch, and the batch's posterior states.
 
+    :param pixel_weight: weight of the pixels that a MarkedBatch marks
     :param options: the keywords of `world_model_loss`
     """
     post, post_logits, prior_logits = model.observe(batch, generator)
-    error = model.reconstruction_error(post, batch.image)
+    error = model.batch_error(post, batch, pixel_weight)
     return world_model_loss(error, post_logits, prior_logits, **options), post

@@ -153,7 +153,7 @@ class Divided:
     :param passes: over each process's share, to save memory
     :param batch_size: rows of the whole batch
     :param autocast: what a forward pass runs in
-    :param options: keywords of `world_model_loss`
+    :param options: `Learner.eq_1_options`
     :raises ValueError: a batch that cannot be divided so
     """
 
@@ -241,8 +241,8 @@ class _Objective(nn.Module):
         self, batch: Batch, draws: Share, whole: Callable[[Tensor], Tensor]
     ) -> WorldModelLoss:
         post, post_logits, prior_logits = self.model.observe(batch, draws)
-        error = self.model.reconstruction_error(post, batch.image)
         options = dict(self.options)
+        error = self.model.batch_error(post, batch, options.pop("pixel_weight"))
         if options["free_nats_mode"] == "mean":
             kl = kl_one_hot(post_logits, prior_logits).mean().detach()
             options["free_nats"] = part_free_nats(options["free_nats"], kl, whole(kl))

@@ -102,6 +102,12 @@ class Hyperparameters(Keywords):
     free_nats_mode: str = choice(
         "mean", ("mean", "element"), '"mean" (WPT) or "element" (DreamerV3)', Stage.PRETRAINING
     )
+    pixel_weight: float = amount(
+        1.0,
+        "weight in Eq. (1) of the pixels that differ from their trajectory's median image, so that "
+        "small things that move are not lost in a large background; not in the paper. 1: off",
+        Stage.PRETRAINING,
+    )
     precision: str = choice(
         "fp32",
         ("fp32", "bf16"),
@@ -249,6 +255,11 @@ class Hyperparameters(Keywords):
     def resolved(self) -> Self:
         """Return a copy in which the size's own values stand where None stood."""
         return self.changed(**{name: self.value(name) for name in SIZES_OWN})
+
+    @property
+    def marks(self) -> bool:
+        """Whether batches must mark the pixels that move."""
+        return self.pixel_weight != 1
 
     @property
     def imitates(self) -> bool:

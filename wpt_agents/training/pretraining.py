@@ -50,6 +50,7 @@ def world_model_updates(
         start=start,
         pin=learner.policy.device.type == "cuda",
         share=world.share(settings.batch_size),
+        mark=settings.marks,
     )
     if world.size == accumulate == 1:
         update = whole_update(learner, streams)

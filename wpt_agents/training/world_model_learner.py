@@ -95,8 +95,8 @@ class WorldModelLearner:
 
     @property
     def eq_1_options(self) -> dict[str, Any]:
-        """The keywords of `world_model_loss`."""
-        names = ("dyn_scale", "rep_scale", "free_nats", "free_nats_mode")
+        """The keywords of `world_model_update_loss`."""
+        names = ("dyn_scale", "rep_scale", "free_nats", "free_nats_mode", "pixel_weight")
         return {name: getattr(self.hyperparameters, name) for name in names}
 
     def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> Tensor:

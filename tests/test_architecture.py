@@ -54,15 +54,15 @@ AGENT = [n for n, _ in modules("wpt_agents") if n != "wpt_agents"]
 
 @pytest.mark.parametrize("module", AGENT)
 def test_each_module_imports_only_from_its_own_folder_and_those_below(module):
-    own = folder(module)
+    room = folder(module)
     others = {folder(other) for other in within("wpt_agents")[module] - {"wpt_agents"}}
-    above = {other for other in others if LAYERS.index(other) < LAYERS.index(own)}
-    assert not {(own, other) for other in above}
+    above = {other for other in others if LAYERS.index(other) < LAYERS.index(room)}
+    assert not {(room, other) for other in above}
 
 
 @pytest.mark.parametrize("package", ["wpt_agents", "wpt_envs"])
 def test_no_module_imports_itself_through_others_not_even_lazily(package):
-    graph = {n: {i for i in found if i != package} for n, found in within(package).items()}
+    graph = {n: {i for i in imported if i != package} for n, imported in within(package).items()}
     TopologicalSorter(graph).prepare()  # raises CycleError with the cycle
 
 
@@ -91,8 +91,8 @@ def test_only_the_zoo_knows_both_agent_and_tasks():
 def test_the_reader_of_imports_sees_lazy_and_relative_ones(tmp_path):
     path = tmp_path / "rssm.py"
     path.write_text("def f():\n    from ..agents.wpt import WPT\n    import wpt_agents.zoo\n")
-    found = set(imports("wpt_agents.model.rssm", path))
-    assert {"wpt_agents.agents.wpt", "wpt_agents.zoo"} <= found
+    seen = set(imports("wpt_agents.model.rssm", path))
+    assert {"wpt_agents.agents.wpt", "wpt_agents.zoo"} <= seen
 
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -105,8 +105,10 @@ def declared(*extras):
     lines = [*PYPROJECT["dependencies"]]
     for extra in extras:
         lines += PYPROJECT["optional-dependencies"][extra]
-    found = {re.split("[<>=;\\[ ]", line)[0].replace("-", "_") for line in lines}
-    return {NAMES.get(name, name) for name in found} | (SIMULATORS if "sims" in extras else set())
+    packages = {re.split("[<>=;\\[ ]", line)[0].replace("-", "_") for line in lines}
+    return {NAMES.get(name, name) for name in packages} | (
+        SIMULATORS if "sims" in extras else set()
+    )
 
 
 @pytest.mark.parametrize(

@@ -81,9 +81,9 @@ def dots():
 @pytest.mark.filterwarnings("ignore:rich is experimental")  # says tqdm of the bar that SB3 takes
 def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
     code = EXAMPLE
-    for given, tiny in TINY.items():
-        assert given in code, given
-        code = code.replace(given, tiny)
+    for full, tiny in TINY.items():
+        assert full in code, full
+        code = code.replace(full, tiny)
     monkeypatch.chdir(tmp_path)
     settings = {name: value for name, value in SETTINGS.items() if name != "seed"}
     exec(code, left := {"SETTINGS": settings})
@@ -137,14 +137,14 @@ def test_every_command_of_readme_and_docs_is_understood(command):
     parser = get_command(command_line.app)
     while isinstance(parser, TyperGroup):
         _, parser, words = parser.resolve_command(typer.Context(parser), words)
-    given = parser.make_context("zoo", words).params
-    tasks = [task for task in given.get("tasks") or [] if "$" not in task]
-    suite = given.get("suite") or "dmc"
+    options = parser.make_context("zoo", words).params
+    tasks = [task for task in options.get("tasks") or [] if "$" not in task]
+    suite = options.get("suite") or "dmc"
     find_tasks(suite, tasks)
-    if given.get("preset") and suite in suite_names():
-        load_preset(suite, given["preset"], given.get("settings") or [])
-    assert set(given.get("method") or []) <= set(METHODS)
-    assert (given.get("behaviour") or "noise") in BEHAVIOURS
+    if options.get("preset") and suite in suite_names():
+        load_preset(suite, options["preset"], options.get("settings") or [])
+    assert set(options.get("method") or []) <= set(METHODS)
+    assert (options.get("behaviour") or "noise") in BEHAVIOURS
 
 
 def test_every_task_and_keyword_that_is_named_exists():

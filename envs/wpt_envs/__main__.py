@@ -60,9 +60,9 @@ def _likeness(states: int, suite: str | None) -> None:
     from wpt_envs.measure import likeness
 
     for task in _chosen(suite):
-        found = likeness(task, states)
+        ratio = likeness(task, states)
         print(
-            f"{task.id:44s} near {found['near']:5.1f} dB  fast {found['fast']:5.1f} dB", flush=True
+            f"{task.id:44s} near {ratio['near']:5.1f} dB  fast {ratio['fast']:5.1f} dB", flush=True
         )
 
 

@@ -170,9 +170,9 @@ class _LookDrawn(gym.Wrapper):
         """The view of the simulation, a new one where the environment has made a new model."""
         from wpt_envs.rendering import View  # brings MuJoCo, which a CartPole does not need
 
-        found = model_and_data(self._simulation)
-        assert found is not None, self._simulation
-        model, data = found
+        simulation = model_and_data(self._simulation)
+        assert simulation is not None, self._simulation
+        model, data = simulation
         if self._view is None or model is not self._model:
             if self._view is not None:
                 self._view.close()

@@ -107,8 +107,8 @@ def _check_device() -> None:
 
 
 def _suspects() -> str:
-    found = [f"{name}={os.environ[name]}" for name in _EGL_VARIABLES if os.environ.get(name)]
-    return f" What is set may be the cause: {', '.join(found)}." if found else ""
+    suspects = [f"{name}={os.environ[name]}" for name in _EGL_VARIABLES if os.environ.get(name)]
+    return f" What is set may be the cause: {', '.join(suspects)}." if suspects else ""
 
 
 # ------------------------------------------------------------------------------- what works

@@ -46,15 +46,15 @@ def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
     """Return the mean PSNR in dB of `near` and `fast` against `exact`."""
     env = _bare(task)
     looks = views(env)
-    found: dict[str, list[float]] = {"near": [], "fast": []}
+    ratios: dict[str, list[float]] = {"near": [], "fast": []}
     for _ in visit_states(env, states):
         exact = looks["exact"].look(size)
-        for rendering, values in found.items():
+        for rendering, values in ratios.items():
             values.append(psnr(looks[rendering].look(size), exact))
     for view in looks.values():
         view.close()
     env.close()
-    return {rendering: float(np.mean(values)) for rendering, values in found.items()}
+    return {rendering: float(np.mean(values)) for rendering, values in ratios.items()}
 
 
 def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:

@@ -143,16 +143,16 @@ def test_an_ensemble_agrees_where_it_has_been_and_disagrees_elsewhere():
 
 def test_no_gradient_of_the_ensemble_reaches_the_world_model():
     """One update of Plan2Explore leaves the world model as one of WPT does."""
-    batch, found = batch_of(recorded(8), recorded(8, seed=1)), []
+    batch, outcomes = batch_of(recorded(8), recorded(8, seed=1)), []
     for kind in (WPT, Plan2Explore):
         model = explorer(kind)
         before = weights(model, "world_model.")
         if kind is Plan2Explore:
-            model.policy.load_state_dict({**weights(model), **found[0][0]})
+            model.policy.load_state_dict({**weights(model), **outcomes[0][0]})
         model.learner.update_world_model(batch, generator())
-        found.append((before, weights(model, "world_model.")))
-    assert same(found[0][1], found[1][1])
-    assert not same(*found[0])
+        outcomes.append((before, weights(model, "world_model.")))
+    assert same(outcomes[0][1], outcomes[1][1])
+    assert not same(*outcomes[0])
 
 
 def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_only():
@@ -176,7 +176,7 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
 def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
     model, batch = explorer(Plan2Explore), batch_of(recorded(8), recorded(8, seed=1))
     batch.is_first[0, 4] = True  # an episode's edge
-    ensemble = copy.deepcopy(model.policy.curiosity)  # as it is before the update
+    ensemble = copy.deepcopy(model.policy.curiosity)  # a copy from before the update
     post, _ = model.learner.update_world_model(batch, generator())
     dream = model.policy.dream(post.flatten_time(), 2, generator())
     paid = model.learner.imagined_reward(dream, torch.arange(18))[:, 0].view(2, 9)
@@ -189,7 +189,7 @@ def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
 
 @pytest.mark.parametrize("kind", EXPLORERS.values())
 def test_the_tasks_reward_teaches_nothing(kind):
-    batch, found = batch_of(recorded(8), recorded(8, seed=1)), []
+    batch, outcomes = batch_of(recorded(8), recorded(8, seed=1)), []
     for reward in (0.0, 1000.0):
         model = explorer(kind)
         paid = replace(
@@ -199,8 +199,8 @@ def test_the_tasks_reward_teaches_nothing(kind):
         )
         _, metrics = model.learner.update_world_model(paid, generator(), learn_reward=True)
         assert metrics["explore/surprise"] > 0
-        found.append(weights(model))
-    assert same(*found)
+        outcomes.append(weights(model))
+    assert same(*outcomes)
 
 
 def test_icms_reward_head_learns_the_scaled_surprise_of_each_step():
@@ -209,14 +209,14 @@ def test_icms_reward_head_learns_the_scaled_surprise_of_each_step():
     batch.is_first[0, 4] = True  # an episode's edge
     with torch.no_grad():
         surprise = model.policy.curiosity(batch.image, batch.action)[1]
-    model.policy.world_model.observe = lambda given, _: seen.append(given) or stop()
+    model.policy.world_model.observe = lambda taught, _: seen.append(taught) or stop()
     with pytest.raises(StopIteration):
         model.learner.update_world_model(batch, generator(), learn_reward=True)
-    [given] = seen
+    [taught] = seen
     within = ~batch.is_first[:, 1:]
-    assert (given.reward_known[:, 1:] == within).all() and not given.reward_known[:, 0].any()
-    torch.testing.assert_close(given.reward[:, 1:], surprise / surprise[within].mean())
-    assert batch.reward.abs().sum() == 0  # the batch that was given stays as it was
+    assert (taught.reward_known[:, 1:] == within).all() and not taught.reward_known[:, 0].any()
+    torch.testing.assert_close(taught.reward[:, 1:], surprise / surprise[within].mean())
+    assert batch.reward.abs().sum() == 0  # the caller's batch is unchanged
 
 
 def stop():

@@ -210,16 +210,16 @@ def test_a_file_cut_short_anywhere_is_refused(small):
 
 
 def test_a_flipped_bit_anywhere_is_refused_or_does_no_harm(small):
-    (about, tensors), refused = read_model(io.BytesIO(small)), 0
+    (header, tensors), refused = read_model(io.BytesIO(small)), 0
     for i in range(len(small)):
         damaged = small[:i] + bytes([small[i] ^ (1 << i % 8)]) + small[i + 1 :]
         try:
-            found, groups = read_model(io.BytesIO(damaged))
+            reread, groups = read_model(io.BytesIO(damaged))
         except ValueError as error:
             assert "load another copy" in str(error)
             refused += 1
         else:  # a date in the zip's directory, say
-            assert found == about and torch.equal(groups["policy"]["a"], tensors["policy"]["a"])
+            assert reread == header and torch.equal(groups["policy"]["a"], tensors["policy"]["a"])
     assert refused > len(small) / 2
 
 
@@ -301,9 +301,9 @@ def test_a_model_saved_on_one_device_loads_on_another(tmp_path):
 
 def test_a_file_without_a_counter_is_refused_by_name(learnt, tmp_path):
     learnt.save(tmp_path / "model")
-    about, tensors = read_model(tmp_path / "model.zip")
-    del about["counters"]["credit"], about["groups"]
-    write_model(tmp_path / "old.zip", about, tensors)
+    header, tensors = read_model(tmp_path / "model.zip")
+    del header["counters"]["credit"], header["groups"]
+    write_model(tmp_path / "old.zip", header, tensors)
     with pytest.raises(ValueError, match="lacks credit: it was written by an earlier"):
         WPT.load(tmp_path / "old.zip")
 
@@ -314,8 +314,8 @@ def test_a_file_without_a_counter_is_refused_by_name(learnt, tmp_path):
 def test_a_shared_world_model_holds_no_other_network_and_no_path(store, tmp_path):
     model = pretrained(store, steps=3)
     model.save_world_model(tmp_path / "shared.zip")
-    about, tensors = read_model(tmp_path / "shared.zip")
-    assert list(tensors) == ["world_model"] and "dataset" not in about
+    header, tensors = read_model(tmp_path / "shared.zip")
+    assert list(tensors) == ["world_model"] and "dataset" not in header
     names = {".".join(name.split(".")[:2]) for name in tensors["world_model"]}
     assert names == {"world_model.encoder", "world_model.rssm", "world_model.decoder"}
     assert {tensor.dtype for tensor in tensors["world_model"].values()} == {torch.bfloat16}

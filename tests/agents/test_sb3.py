@@ -241,8 +241,8 @@ def test_the_state_matters_and_no_episode_start_means_that_none_begins():
     _, state = model.predict(noise(2), deterministic=True)
     image = noise(2, seed=1)
     fresh, follows, said = (
-        model.predict(image, *given, deterministic=True)[1][0]
-        for given in ((), (state,), (state, np.zeros(2, bool)))
+        model.predict(image, *arguments, deterministic=True)[1][0]
+        for arguments in ((), (state,), (state, np.zeros(2, bool)))
     )
     assert not np.allclose(fresh, follows)
     np.testing.assert_array_equal(follows, said)

@@ -227,15 +227,15 @@ def test_the_query_is_an_episodes_first_image_also_in_the_middle_of_one(store):
 
 
 def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
-    def found(start, seed):
+    def retrieved(start, seed):
         model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
         model.set_env(DotEnv())
         model.env.seed(start)
         return tuple(model.learn(1).retrieved_ids)
 
-    assert found(1, seed=0) == found(2, seed=0)
-    assert len({found(1, seed) for seed in range(6)}) > 1
-    assert all(i < 4 for seed in range(6) for i in found(1, seed))
+    assert retrieved(1, seed=0) == retrieved(2, seed=0)
+    assert len({retrieved(1, seed) for seed in range(6)}) > 1
+    assert all(i < 4 for seed in range(6) for i in retrieved(1, seed))
 
 
 def test_retrieval_without_data_of_the_width_says_what_to_do(store):
@@ -361,10 +361,10 @@ def test_the_latent_is_filtered_with_the_action_that_was_executed(monkeypatch):
 
 def test_without_a_prior_actor_the_warm_up_is_uniform_and_the_actor_takes_over():
     model = agent(DotEnv(), warmup_steps=LENGTH, train_ratio=0).learn(2 * LENGTH)
-    warm, own = (t.action for t in model.replay_buffer.trajectories)
+    warm, acted = (t.action for t in model.replay_buffer.trajectories)
     # the actor of fresh weights is a normal of mean about 0; the uniform's quartiles are at 0.5
     assert 0.3 < (np.abs(warm) > 0.5).mean() < 0.7
-    assert not (warm == own).any()
+    assert not (warm == acted).any()
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -542,8 +542,8 @@ def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch
     model = pretrained(store, env=DotEnv(), bc_steps=3)
     descend, steps = cloning.descend, []
 
-    def interrupted(*given):
-        steps.append(descend(*given))
+    def interrupted(*arguments):
+        steps.append(descend(*arguments))
         if len(steps) == 2:
             monkeypatch.undo()
             raise KeyboardInterrupt
@@ -768,8 +768,8 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
         frames = None
         for t in range(5):
             frames = stack_frames(batch.image[b, t : t + 1].numpy(), frames, None)
-            own = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
-            error = (own - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
+            mode = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
+            error = (mode - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
             by_hand += [error.mean().item()] * (t >= 2)
     loss = model.learner.imitation_loss(post, batch)
     assert model.num_timesteps == 50  # half way from 20 to 0

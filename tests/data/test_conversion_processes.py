@@ -91,14 +91,14 @@ def test_labels_in_any_script_are_read_where_the_locale_is_ascii(tmp_path):
     )
     environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "LC_ALL": "C"}
     environment |= {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "HOME": str(tmp_path)}
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path / "data")],
         env=environment,
         capture_output=True,
         text=True,
         check=True,
     )
-    assert told.stdout.strip() == ascii(task)
+    assert process.stdout.strip() == ascii(task)
 
 
 def opens_text(call):

@@ -129,9 +129,9 @@ def test_batch_k_depends_on_seed_purpose_and_k_alone(tmp_path):
 
     def starts(purpose, start):
         batches = dataset.batches(4, 9, 2, seed=1, purpose=purpose, start=start)
-        found = [next(batches).image[:, 0, 0, 0, 0].tolist() for _ in range(5)]
+        firsts = [next(batches).image[:, 0, 0, 0, 0].tolist() for _ in range(5)]
         batches.close()
-        return found
+        return firsts
 
     drawn = [dataset.sample(4, 9, 2, rng([1, 0, k])).image[:, 0, 0, 0, 0].tolist() for k in (3, 4)]
     assert starts(0, 3)[:2] == starts(0, 0)[3:] == drawn

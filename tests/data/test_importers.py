@@ -36,10 +36,10 @@ def check_follows(trajectory):
     np.testing.assert_allclose(trajectory.reward, state[1:] / 251, rtol=1e-5)
 
 
-def check_same(found, expected, images=None):
-    check_follows(found)
-    np.testing.assert_array_equal(found.image, expected.image[:images])
-    assert found.terminated == expected.terminated
+def check_same(episode, expected, images=None):
+    check_follows(episode)
+    np.testing.assert_array_equal(episode.image, expected.image[:images])
+    assert episode.terminated == expected.terminated
 
 
 # Shared by all
@@ -179,8 +179,8 @@ def test_episodes_of_a_single_image_are_left_out_aloud(tmp_path, save):
     with pytest.warns(UserWarning, match="in: 2 episodes of a single image left out") as warned:
         episodes = open_episodes(tmp_path / "in", **SMALL)
     assert len(warned) == 1
-    for found, expected in zip(episodes, [old[1], old[3]], strict=True):
-        check_same(found, expected)
+    for episode, expected in zip(episodes, [old[1], old[3]], strict=True):
+        check_same(episode, expected)
     TrajectoryDataset.from_episodes(episodes, tmp_path / "out")
     assert TrajectoryDataset.from_episodes(episodes, tmp_path / "out").lengths.tolist() == [5, 7]
 
@@ -371,8 +371,8 @@ def test_an_sb3_buffer_comes_back_as_its_episodes(channels_first):
     old = [chain(5, 0, terminated=True), chain(7, 1), chain(1, 2)]
     new = list(SB3Episodes(sb3_buffer(old, 50, channels_first), **SMALL))
     assert len(new) == 3
-    for found, expected in zip(new, old, strict=True):
-        check_same(found, expected)
+    for episode, expected in zip(new, old, strict=True):
+        check_same(episode, expected)
 
 
 def test_an_episode_that_sb3_left_for_a_new_one_ends_there():
@@ -396,8 +396,8 @@ def test_a_ring_that_has_gone_round_is_read_oldest_first():
     # 17 steps in a ring of 13: the first episode has lost 4 of its 6 steps
     assert [len(trajectory) for trajectory in new] == [2, 7, 4]
     np.testing.assert_array_equal(new[0].image, old[0].image[4:])
-    for found, expected in zip(new[1:], old[1:], strict=True):
-        check_same(found, expected)
+    for episode, expected in zip(new[1:], old[1:], strict=True):
+        check_same(episode, expected)
 
 
 @pytest.mark.filterwarnings("ignore:.*of a single image left out")  # what is left of the oldest
@@ -406,9 +406,9 @@ def test_a_buffer_that_saves_memory_has_lost_each_last_observation(size):
     old = [chain(6, 0, terminated=True), chain(7, 1), chain(4, 2)]
     kwargs = {"optimize_memory_usage": True, "handle_timeout_termination": False}
     new = list(SB3Episodes(sb3_buffer(old, size, **kwargs), **SMALL))
-    for found in new:
-        check_follows(found)
-        assert not found.terminated
+    for episode in new:
+        check_follows(episode)
+        assert not episode.terminated
     np.testing.assert_array_equal(new[-2].image, old[1].image[:7])
 
 
@@ -464,8 +464,8 @@ def test_hdf5_with_next_observations_keeps_every_action(tmp_path):
     old = [chain(5, 0, terminated=True), chain(7, 1), chain(1, 2)]
     save_hdf5(tmp_path / "data.hdf5", old, with_next=True)
     new = list(open_episodes(tmp_path / "data.hdf5", **LIMITS, **SMALL))
-    for found, expected in zip(new, old, strict=True):
-        check_same(found, expected)
+    for episode, expected in zip(new, old, strict=True):
+        check_same(episode, expected)
 
 
 def test_hdf5_without_next_observations_leaves_each_last_action_out(tmp_path):
@@ -524,8 +524,8 @@ def test_minari_episodes_come_back_as_they_were(tmp_path, monkeypatch, nested, f
     key = "pixels" if nested else None
     for source, name in ((tmp_path / "chain" / "test-v0", None), ("chain/test-v0", "minari")):
         new = list(open_episodes(source, name, image_key=key, **SMALL))
-        for found, expected in zip(new, old, strict=True):
-            check_same(found, expected)
+        for episode, expected in zip(new, old, strict=True):
+            check_same(episode, expected)
         assert new[1].source == "chain/test-v0 episode 1"
 
 
@@ -549,7 +549,7 @@ def test_images_that_minari_stored_as_jpeg_are_warned_of(tmp_path, monkeypatch):
 
 
 def level(state):
-    """The chain's states told apart after lossy video: 12 grey levels."""
+    """The chain's states as 12 grey levels, which stay distinct after lossy video."""
     return 10 + 20 * state
 
 
@@ -742,8 +742,8 @@ def test_rlds_episodes_keep_to_the_chain_and_the_last_action_means_nothing(tmp_p
     save_rlds(tmp_path / "1.0.0/chain-test.tfrecord-00000-of-00001", old[:1])
     new = list(open_episodes(tmp_path, split="train", embodiment="arm", **SMALL))
     assert len(new) == 3
-    for found, expected in zip(new, old, strict=True):
-        check_same(found, expected)
+    for episode, expected in zip(new, old, strict=True):
+        check_same(episode, expected)
     assert new[2].embodiment == "arm"
     assert new[2].source == "1.0.0/chain-train.tfrecord-00001-of-00002 at byte 12"
     assert len(TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", **SMALL)) == 4
@@ -808,8 +808,8 @@ def test_the_command_converts_with_labels_and_prints_what_came_of_it(tmp_path, m
     save_npz(tmp_path / "in/0.npz", chain(5, size=64))
     labels = ["--embodiment", "walker", "--task", "run", "--rewards"]
     assert call(monkeypatch, "import", "npz", tmp_path / "in", tmp_path / "out", *labels) == 0
-    told = capsys.readouterr().out
-    assert "walker" in told and "Dataset:" in told and "codec" not in told
+    printed = capsys.readouterr().out
+    assert "walker" in printed and "Dataset:" in printed and "codec" not in printed
     [new] = TrajectoryDataset.open(tmp_path / "out")
     check_same(new, chain(5, size=64))
     assert (new.embodiment, new.task) == ("walker", "run")

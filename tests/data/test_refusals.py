@@ -27,7 +27,7 @@ def model(path, member):
         archive.writestr(member, "{}")
 
 
-FILES = {  # what is there, which path is given, what the answer says
+FILES = {  # what the folder holds, which path is opened, what the message says
     "mt30/chunk_0.pt": [
         ("mt30/chunk_0.pt", r"\.pt file of torch.* import tdmpc2 .*chunk_0\.pt DST`, with --trust"),
         ("mt30", r"holds \.pt files of torch.* import tdmpc2"),
@@ -43,12 +43,12 @@ FILES = {  # what is there, which path is given, what the answer says
 
 
 @pytest.mark.parametrize(
-    ("file", "given", "words"), [(f, *case) for f, cases in FILES.items() for case in cases]
+    ("file", "path", "words"), [(f, *case) for f, cases in FILES.items() for case in cases]
 )
-def test_files_of_other_kinds_are_called_by_name(tmp_path, file, given, words):
+def test_files_of_other_kinds_are_called_by_name(tmp_path, file, path, words):
     write(tmp_path / file)
     with pytest.raises(ValueError, match=words):
-        open_dataset(tmp_path / given)
+        open_dataset(tmp_path / path)
 
 
 @pytest.mark.parametrize(

@@ -65,19 +65,19 @@ def test_only_the_action_width_asked_for():
 
 
 def test_a_label_excludes_others_and_keeps_the_unlabelled():
-    found = retriever([[0], [1], [2]], embodiments=["cheetah", "walker", None])
-    assert found.search(np.zeros(1), 3, "walker")[0].tolist() == [1, 2]
-    assert found.search(np.zeros(1), 3, "crab", action_dim=2)[0].tolist() == [2]
+    index = retriever([[0], [1], [2]], embodiments=["cheetah", "walker", None])
+    assert index.search(np.zeros(1), 3, "walker")[0].tolist() == [1, 2]
+    assert index.search(np.zeros(1), 3, "crab", action_dim=2)[0].tolist() == [2]
 
 
 def test_drawing_blindly_keeps_to_the_candidates_and_takes_each_once():
-    found = retriever([[0]] * 6, action_dims=[6, 2, 6, 6, 6, 6])
-    drawn = [found.draw(3, np.random.default_rng(seed), None, 6).tolist() for seed in range(40)]
-    assert all(len(set(each)) == 3 for each in drawn) and {i for d in drawn for i in d} == {
+    index = retriever([[0]] * 6, action_dims=[6, 2, 6, 6, 6, 6])
+    drawn = [index.draw(3, np.random.default_rng(seed), None, 6).tolist() for seed in range(40)]
+    assert all(len(set(numbers)) == 3 for numbers in drawn) and {i for d in drawn for i in d} == {
         0,
         *range(2, 6),
     }
-    assert sorted(found.draw(9, np.random.default_rng(0), None, 6)) == [0, 2, 3, 4, 5]
+    assert sorted(index.draw(9, np.random.default_rng(0), None, 6)) == [0, 2, 3, 4, 5]
 
 
 def test_no_candidate_is_an_empty_answer():

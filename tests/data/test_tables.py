@@ -50,8 +50,8 @@ def test_robomimic_demos_come_in_numeric_order_and_keep_to_the_chain(tmp_path, w
     save_robomimic(tmp_path / "image.hdf5", old, with_next)
     new = list(open_episodes(tmp_path / "image.hdf5", **SMALL))
     assert len(new) == 12
-    for found, expected in zip(new, old, strict=True):
-        check(found, expected, None if with_next else len(expected))
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected, None if with_next else len(expected))
     assert (new[10].source, new[10].task) == ("image.hdf5 data/demo_10", "Lift")
 
 
@@ -87,8 +87,8 @@ def test_aloha_has_a_file_an_episode(tmp_path):
             file["observations/qpos"] = np.zeros((len(t), 14))
             file["observations/images/top"] = t.image[:-1]
     assert recognise(tmp_path) == "hdf5"
-    for found, expected in zip(open_episodes(tmp_path, **SMALL), old, strict=True):
-        check(found, expected, len(expected))
+    for episode, expected in zip(open_episodes(tmp_path, **SMALL), old, strict=True):
+        check(episode, expected, len(expected))
     [one] = open_episodes(tmp_path / "episode_1.hdf5", **SMALL)
     check(one, old[1], len(old[1]))
 
@@ -100,11 +100,11 @@ def test_groups_with_an_observation_more_than_actions_keep_every_action(tmp_path
             file[f"traj_{i}/actions"] = t.action
             file[f"traj_{i}/obs/sensor_data/base_camera/rgb"] = t.image
             file[f"traj_{i}/terminated"] = np.arange(len(t)) == len(t) - 1
-    for found, expected in zip(
+    for episode, expected in zip(
         open_episodes(tmp_path / "a.h5", image_key="rgb", **SMALL), old, strict=True
     ):
-        check(found, expected)
-        assert found.terminated
+        check(episode, expected)
+        assert episode.terminated
 
 
 def rows(trajectories, image="observations", action="actions"):
@@ -140,8 +140,8 @@ def test_flat_rows_end_where_any_of_the_usual_flags_says(tmp_path, flags):
     old = [chain(5, 0), chain(7, 1), chain(2, 2)]
     arrays = rows(old) | {name: last(old) * on for name, on in flags.items()}
     new = list(open_episodes(save(tmp_path / "a.hdf5", arrays), **SMALL))
-    for found, expected in zip(new, old, strict=True):
-        check(found, expected, len(expected))
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected, len(expected))
 
 
 def test_a_flag_of_another_name_is_named_by_done_key(tmp_path):
@@ -164,11 +164,11 @@ def test_the_companion_of_nested_images_gives_the_last_observation(tmp_path):
     path = save(tmp_path / "a.hdf5", arrays)
     with pytest.raises(ValueError, match="no usual name; there are images in: observations/image"):
         open_episodes(path, **SMALL)
-    for found, expected in zip(
+    for episode, expected in zip(
         open_episodes(path, image_key="observations/image", **SMALL), old, strict=True
     ):
-        check(found, expected)
-        assert found.terminated
+        check(episode, expected)
+        assert episode.terminated
 
 
 def save_dm_env(path, trajectories, first=0.0):
@@ -189,10 +189,10 @@ def save_dm_env(path, trajectories, first=0.0):
 def test_rows_of_dm_env_are_shifted_back(tmp_path):
     old = [chain(5, 0, terminated=True), chain(7, 1)]
     path = save_dm_env(tmp_path / "a.hdf5", old)
-    for found, expected in zip(open_episodes(path, rewards=True, **SMALL), old, strict=True):
-        check(found, expected)
-        np.testing.assert_allclose(found.reward, expected.reward)
-        assert found.terminated == expected.terminated
+    for episode, expected in zip(open_episodes(path, rewards=True, **SMALL), old, strict=True):
+        check(episode, expected)
+        np.testing.assert_allclose(episode.reward, expected.reward)
+        assert episode.terminated == expected.terminated
 
 
 def test_rows_of_step_types_without_placeholders_are_asked_about(tmp_path):
@@ -306,8 +306,8 @@ def test_zarr_rows_end_at_episode_ends(tmp_path, dtype, version):
     with pytest.raises(ValueError, match=r"dimension . runs from .* low=\[.*\], high=\[.*--low="):
         open_episodes(tmp_path / "pusht.zarr", **SMALL)[0]
     new = list(open_episodes(tmp_path / "pusht.zarr", low=0, high=512, **SMALL))
-    for found, expected in zip(new, old, strict=True):
-        check(found, expected, len(expected))
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected, len(expected))
     assert new[0].bounds.tolist() == [[0, 0], [512, 512]]
 
 
@@ -341,8 +341,8 @@ def test_tdmpc2_actions_lead_to_the_observation_and_are_shifted_back(tmp_path):
     save_tdmpc2(tmp_path / "chunk_0.pt", old)
     save_tdmpc2(tmp_path / "chunk_1.pt", [replace(old[0], action=old[0].action)])
     new = list(open_episodes(tmp_path, "tdmpc2", **SMALL))
-    for found, expected in zip(new, [*old, old[0]], strict=True):
-        check(found, expected)
+    for episode, expected in zip(new, [*old, old[0]], strict=True):
+        check(episode, expected)
 
 
 def test_a_pickle_of_tdmpc2_is_loaded_by_those_who_trust_it_only(tmp_path):

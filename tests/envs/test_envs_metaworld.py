@@ -108,18 +108,20 @@ def successes():
 def test_the_scripted_policies_succeed_as_often_as_recorded_on_every_task(successes):
     # Of 5 and 5 episodes Fisher's exact test tells apart, below 5 %, 0 from 4, and 1 from 5.
     for name, recorded in SCRIPTED.items():
-        for found, wanted in zip(successes[name], recorded, strict=True):
-            table = [[found, EPISODES - found], [wanted, EPISODES - wanted]]
+        for count, expected in zip(successes[name], recorded, strict=True):
+            table = [[count, EPISODES - count], [expected, EPISODES - expected]]
             assert fisher_exact(table).pvalue > 0.05, (name, successes[name], recorded)
 
 
 @pytest.mark.filterwarnings("ignore:Constant.s. may be too high")
 @pytest.mark.parametrize("column", [0, 1], ids=["last", "any"])
 def test_the_scripted_policies_succeed_as_often_as_recorded_over_all_tasks(successes, column):
-    found, wanted = (np.array(list(each.values()))[:, column] for each in (successes, SCRIPTED))
-    share = (found + wanted) / (2 * EPISODES)
+    measured, recorded = (
+        np.array(list(table.values()))[:, column] for table in (successes, SCRIPTED)
+    )
+    share = (measured + recorded) / (2 * EPISODES)
     deviation = np.sqrt(np.sum(2 * EPISODES * share * (1 - share)))  # of a difference of binomials
-    assert abs(found.sum() - wanted.sum()) < 3 * max(deviation, 1)
+    assert abs(measured.sum() - recorded.sum()) < 3 * max(deviation, 1)
 
 
 def test_the_picture_stands_upright():

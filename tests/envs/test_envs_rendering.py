@@ -122,7 +122,7 @@ def resident_mb():
         return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def held():
+def in_use():
     """Open contexts, open files, and memory in MB."""
     return open_contexts(), len(os.listdir("/proc/self/fd")), resident_mb()
 
@@ -147,10 +147,10 @@ BALL = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></muj
 def test_opening_and_closing_leaks_neither_contexts_nor_files_nor_memory(open_and_close, times):
     for _ in range(times // 3):
         open_and_close()
-    contexts, files, memory = held()
+    contexts, files, memory = in_use()
     for _ in range(times - times // 3):
         open_and_close()
-    later = held()
+    later = in_use()
     assert later[:2] == (contexts, files)
     assert later[2] < memory + 40  # one leaked in ten would be more: a context takes 20 MB or so
 
@@ -183,7 +183,7 @@ def test_a_camera_is_chosen_by_name_number_or_placement():
     env = make("dmc-walker-run", camera="back", rendering="fast")
     numbered = make("dmc-walker-run", camera=1, rendering="fast")
     free = make("dmc-walker-run", camera={"distance": 9.0}, rendering="fast")
-    images = [each.reset(seed=0)[0] for each in (env, numbered, free)]
+    images = [view.reset(seed=0)[0] for view in (env, numbered, free)]
     assert np.array_equal(images[0], images[1])
     assert not np.array_equal(images[0], images[2])
 

@@ -42,8 +42,8 @@ def test_importing_loads_no_simulator_no_torch_and_no_agent():
 
 def test_the_ant_sequence_is_six_quadruped_tasks_in_the_papers_order():
     names = [wpt_envs.TASKS[name].name for name in wpt_envs.ANT_SEQUENCE]
-    wanted = ["stand", "walk", "run", "jump", "roll", "roll-fast"]
-    assert names == [f"quadruped-{name}" for name in wanted]
+    order = ["stand", "walk", "run", "jump", "roll", "roll-fast"]
+    assert names == [f"quadruped-{name}" for name in order]
 
 
 def test_a_suites_width_is_that_of_its_widest_embodiment():
@@ -65,12 +65,12 @@ def test_the_zoo_prints_the_table(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["zoo", "list"])
     with pytest.raises(SystemExit):
         command_line.main()
-    told = {tuple(re.findall(r"[\w-]+", line)) for line in capsys.readouterr().out.splitlines()}
+    printed = {tuple(re.findall(r"[\w-]+", line)) for line in capsys.readouterr().out.splitlines()}
     for row in wpt_envs.TASKS.values():
         numbers = str(row.action_dim), str(row.frames)
         paper = "yes" if row.in_paper else "no"
         name = f"{row.suite}-{row.name}"
-        assert (name, row.embodiment, *numbers, row.metric, paper) in told
+        assert (name, row.embodiment, *numbers, row.metric, paper) in printed
 
 
 FAMILIES = {dmc: dmc.DMControl, metaworld: metaworld.MetaWorld, robotics: robotics.Robotics}
@@ -87,11 +87,13 @@ def test_a_family_is_described_in_gymnasiums_form(family):
 
 @pytest.mark.parametrize(("module", "family"), FAMILIES.items())
 def test_every_keyword_of_a_family_is_described_and_no_other(module, family):
-    own = family.__doc__.split("## Arguments")[1].split("## Version")[0]
-    told = re.findall(r"`(\w+)(?:=[^`]*)?`", Simulated.__doc__.split("## Arguments")[1] + own)
-    given = inspect.signature(module.make).parameters.keys() - {"task"}
-    assert given <= set(told)
-    assert set(re.findall(r"- `(\w+)", Simulated.__doc__ + own)) <= given
+    of_family = family.__doc__.split("## Arguments")[1].split("## Version")[0]
+    described = re.findall(
+        r"`(\w+)(?:=[^`]*)?`", Simulated.__doc__.split("## Arguments")[1] + of_family
+    )
+    keywords = inspect.signature(module.make).parameters.keys() - {"task"}
+    assert keywords <= set(described)
+    assert set(re.findall(r"- `(\w+)", Simulated.__doc__ + of_family)) <= keywords
 
 
 def test_an_unknown_suite_is_answered_with_all_suites():

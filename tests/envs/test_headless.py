@@ -13,7 +13,7 @@ NAMES = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID", "DISPLAY", "W
 
 @pytest.fixture
 def chosen(monkeypatch):
-    """Sets variables, chooses, and returns what MuJoCo and PyOpenGL are then told."""
+    """Set variables, choose, and return the platform variables of MuJoCo and PyOpenGL."""
 
     def choose(egl=True, osmesa=False, devices=1, **variables):
         for name in NAMES:

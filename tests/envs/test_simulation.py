@@ -53,8 +53,8 @@ def test_the_physics_are_found_wherever_they_are_kept():
         (Own(sim=simulation), simulation.model),
         (Own(robot=Holder(sim=wrapped)), simulation.model),  # as robosuite has it
     ]:
-        found = find_simulation(env)
-        assert model_and_data(found)[0] is model
+        handle = find_simulation(env)
+        assert model_and_data(handle)[0] is model
         assert np.ptp(wpt_envs.pixels(env, rendering="fast").reset()[0]) > 50
 
 

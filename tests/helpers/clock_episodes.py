@@ -13,4 +13,4 @@ def stored(model):
 
 def all_on_time(model, count):
     """Whether there are that many episodes of the clock, each image in its place."""
-    return len(stored(model)) == count and all(on_time(each) for each in stored(model))
+    return len(stored(model)) == count and all(on_time(episode) for episode in stored(model))

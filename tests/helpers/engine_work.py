@@ -1,4 +1,4 @@
-"""What engines are given to do in tests; light to import, as each worker does it."""
+"""The work that tests hand to engines; light to import, because every worker imports it."""
 
 import os
 import signal

@@ -33,8 +33,8 @@ class Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         repository = "/".join(self.path.split("/")[3:5])
         if self.path == "/api/repos/create":
-            given = json.loads(body)
-            name = "/".join(filter(None, [given.get("organization"), given["name"]]))
+            request = json.loads(body)
+            name = "/".join(filter(None, [request.get("organization"), request["name"]]))
             self.server.files.setdefault(name, {})
             self.answer({"url": f"{self.server.address}/{name}", "name": name, "id": name})
         elif self.path == "/api/validate-yaml":  # of the card
@@ -59,17 +59,17 @@ class Handler(BaseHTTPRequestHandler):
         parts = self.path.split("?")[0].strip("/").split("/")
         if parts[0] == "api":
             repository = "/".join(parts[2:4])
-            held = self.server.files.get(repository)
-            if held is None:
+            stored = self.server.files.get(repository)
+            if stored is None:
                 self.answer({"error": "Repository not found"}, 404)
             elif len(parts) > 4 and parts[4] == "tree":
                 tree = [
                     {"type": "file", "path": n, "size": len(c), "oid": hashlib.sha1(c).hexdigest()}
-                    for n, c in held.items()
+                    for n, c in stored.items()
                 ]
                 self.answer(tree)
             else:
-                siblings = [{"rfilename": name} for name in held]
+                siblings = [{"rfilename": name} for name in stored]
                 self.answer({"id": repository, "sha": COMMIT, "siblings": siblings})
         else:
             content = self.server.files["/".join(parts[:2])]["/".join(parts[4:])]

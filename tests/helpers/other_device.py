@@ -26,21 +26,21 @@ class Elsewhere(torch.Tensor):
     """A tensor on the device "other"."""
 
     @staticmethod
-    def __new__(cls, held):
+    def __new__(cls, tensor):
         wrapper = torch.Tensor._make_wrapper_subclass(
             cls,
-            held.size(),
-            strides=held.stride(),
-            storage_offset=held.storage_offset(),
-            dtype=held.dtype,
+            tensor.size(),
+            strides=tensor.stride(),
+            storage_offset=tensor.storage_offset(),
+            dtype=tensor.dtype,
             device="other:0",
-            requires_grad=held.requires_grad,
+            requires_grad=tensor.requires_grad,
         )
-        wrapper.held = held
+        wrapper.tensor = tensor
         return wrapper
 
     def __repr__(self):
-        return f"Elsewhere({self.held})"
+        return f"Elsewhere({self.tensor})"
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
@@ -50,7 +50,7 @@ class Elsewhere(torch.Tensor):
 def compute(func, args, kwargs):
     """What the CPU makes of it, on the device where a GPU would have it."""
     leaves = tree_leaves((args, kwargs))
-    here = {id(x.held): x for x in leaves if isinstance(x, Elsewhere)}
+    here = {id(x.tensor): x for x in leaves if isinstance(x, Elsewhere)}
     strays = [x for x in leaves if type(x) is torch.Tensor and x.dim()]
     named = [x for x in leaves if isinstance(x, torch.device)]  # where the result is to lie
     copies = func is aten.copy_.default
@@ -66,7 +66,7 @@ def compute(func, args, kwargs):
 def on_cpu(x):
     if isinstance(x, torch.device):
         return torch.device("cpu")
-    return x.held if isinstance(x, Elsewhere) else x
+    return x.tensor if isinstance(x, Elsewhere) else x
 
 
 def on_other(x):

@@ -128,11 +128,11 @@ def recorded(env: gym.Env, seed: int) -> Trajectory:
     low, high = env.action_space.low, env.action_space.high
     rng, images, actions = np.random.default_rng(seed), [env.reset(seed=seed)[0]], []
     for _ in range(STEPS):
-        own = rng.uniform(-1, 1, low.shape).astype(np.float32)
-        action = (low + (own + 1) / 2 * (high - low)).clip(low, high)
+        drawn = rng.uniform(-1, 1, low.shape).astype(np.float32)
+        action = (low + (drawn + 1) / 2 * (high - low)).clip(low, high)
         image, _, terminated, truncated, _ = env.step(action.astype(env.action_space.dtype))
         images.append(image)
-        actions.append(own)
+        actions.append(drawn)
         if terminated or truncated:
             break
     return Trajectory(np.stack(images), np.stack(actions))

@@ -17,7 +17,9 @@ def train(dataset, **changes):
     """The model, and the metrics of each update."""
     seen = {}
     settings = SETTINGS | {"batch_size": 4, "batch_length": 6, "steps": 6} | changes
-    model = WPT.pretrain(dataset, callback=lambda step, told: seen.update({step: told}), **settings)
+    model = WPT.pretrain(
+        dataset, callback=lambda step, metrics: seen.update({step: metrics}), **settings
+    )
     return model, seen
 
 
@@ -37,7 +39,7 @@ def together(rank, folder, jobs):
     try:
         train(folder / "data", run_dir=folder / "killed", **next(iter(jobs.values())))
     except RuntimeError as error:
-        (folder / "told.json").write_text(json.dumps([refused, str(error)]))
+        (folder / "messages.json").write_text(json.dumps([refused, str(error)]))
 
 
 def differing(rank, folder):

@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def jobs(folder):
     _, seen = train(folder / "data")
-    free = float(np.median([told["train/kl"] for told in seen.values()]))
+    free = float(np.median([metrics["train/kl"] for metrics in seen.values()]))
     return {name: changes | {"free_nats": free} for name, changes in JOBS.items()}
 
 
@@ -73,8 +73,8 @@ def pair(folder, jobs):
 
 def assert_equal(seen, after, expected, expected_after, rtol=1e-4):
     assert seen.keys() <= expected.keys() and seen
-    for step, told in seen.items():
-        assert told == pytest.approx(expected[step], rel=rtol), step
+    for step, metrics in seen.items():
+        assert metrics == pytest.approx(expected[step], rel=rtol), step
     assert_close(after, expected_after, rtol)
 
 
@@ -110,7 +110,7 @@ def test_shares_of_a_batch_are_the_batch(folder):
 def test_shares_clip_the_kl_where_the_whole_batch_does(free_nats):
     error = torch.zeros(2, 1)
     # one sequence's KL(q || p) is .8 ln(.8 / .5) + .2 ln(.2 / .5) = .193, the other's .95 ln(1.9) +
-    # .05 ln(.1) = .495; the mean is .344: .4 clips the whole, but not the second by itself
+    # .05 ln(.1) = .495; the mean is .344: .4 clips the whole batch, but not the second row alone
     post = torch.tensor([[0.8, 0.2], [0.95, 0.05]]).log().view(2, 1, 1, 2).requires_grad_()
     prior = torch.full((2, 1, 1, 2), 0.5).log().requires_grad_()
 
@@ -133,7 +133,7 @@ def test_shares_clip_the_kl_where_the_whole_batch_does(free_nats):
 def test_several_passes_over_a_batch_are_one(folder, jobs, alone, name):
     model, seen = train(folder / "data", **jobs[name], accumulate=4)
     assert_equal(seen, weights(model), *alone[name])
-    kls, free = [told["train/kl"] for told in seen.values()], jobs[name]["free_nats"]
+    kls, free = [metrics["train/kl"] for metrics in seen.values()], jobs[name]["free_nats"]
     assert min(kls) < free < max(kls)
 
 
@@ -178,15 +178,15 @@ def test_two_processes_go_on_from_the_checkpoint_of_one(pair, alone):
 
 def test_one_process_goes_on_from_what_a_pair_left_of_which_one_was_killed(pair, jobs, alone):
     assert [path.name for path in (pair / "killed").iterdir()] == ["model.zip"]
-    about, _ = read_model(pair / "killed" / "model.zip")
-    assert about["counters"]["pretrain_steps"] == 4  # of the five made, EVERY being 2
+    header, _ = read_model(pair / "killed" / "model.zip")
+    assert header["counters"]["pretrain_steps"] == 4  # of the five made, EVERY being 2
     model, seen = train(pair / "data", run_dir=pair / "killed", **jobs["mean"])
     assert list(seen) == [5, 6]
     assert_equal(seen, weights(model), *alone["mean"])
 
 
 def test_processes_called_differently_are_refused(pair):
-    refused, _ = json.loads((pair / "told.json").read_text())
+    refused, _ = json.loads((pair / "messages.json").read_text())
     assert "differ in steps, by rank: [6, 7]" in refused
 
 
@@ -229,8 +229,8 @@ def test_a_sigterm_to_one_process_stops_all_and_torchrun_goes_on_to_the_same_mod
     updates = json.loads(attempt.read_text())
     assert updates[0] in (5, 6) and updates[-1] == 6
     model, _ = train(folder / "data")
-    about, tensors = read_model(tmp_path / "model.zip")
-    assert about["counters"]["pretrain_steps"] == 6
+    header, tensors = read_model(tmp_path / "model.zip")
+    assert header["counters"]["pretrain_steps"] == 6
     assert_close(tensors["policy"], weights(model))
 
 

@@ -56,10 +56,10 @@ def test_vectors_of_gymnasium_store_every_image_in_its_place(kind, mode, termina
     model = learnt(vector, 70)  # 35 of each: 5 episodes of 7, 7 of 5
     model.get_env().close()
     for length, count in zip(lengths, (5, 7), strict=True):
-        episodes = [each for each in stored(model) if len(each) == length]
-        assert len(episodes) == count and all(on_time(each, length) for each in episodes)
-    assert {each.terminated for each in stored(model)} == {terminates}
-    infos = [(each["l"], each["r"]) for each in model.ep_info_buffer]
+        episodes = [episode for episode in stored(model) if len(episode) == length]
+        assert len(episodes) == count and all(on_time(episode, length) for episode in episodes)
+    assert {episode.terminated for episode in stored(model)} == {terminates}
+    infos = [(episode["l"], episode["r"]) for episode in model.ep_info_buffer]
     assert set(infos) == {(7, 28.0), (5, 15.0)} and all(model.ep_success_buffer)
 
 
@@ -83,7 +83,7 @@ def test_the_seeds_of_a_vector_count_up_from_the_agents_own():
 
 
 class Own(VectorEnv):
-    """A vector that steps two clocks by itself."""
+    """A vector environment of two clocks that are stepped in its own code."""
 
     def __init__(self, mode):
         self.num_envs, self.clocks = 2, [ClockEnv(), ClockEnv()]
@@ -245,9 +245,9 @@ def test_the_chosen_image_is_seen_in_learning_predicting_and_after_loading(tmp_p
     obs, other = Cameras("top", "wrist").reset()[0], noise()
     model.save(tmp_path / "model")
     loaded = WPT.load(tmp_path / "model", device="cpu")
-    for each in (model, loaded):
-        seen, _ = each.predict({**obs, "wrist": other}, deterministic=True)
-        assert np.array_equal(seen, each.predict(obs["top"], deterministic=True)[0])
+    for learner in (model, loaded):
+        seen, _ = learner.predict({**obs, "wrist": other}, deterministic=True)
+        assert np.array_equal(seen, learner.predict(obs["top"], deterministic=True)[0])
     assert evaluate_policy(model, Monitor(Cameras("top", "wrist")), 1)[0] == 28
 
 

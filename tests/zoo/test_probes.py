@@ -10,13 +10,13 @@ rng = np.random.default_rng(0)
 
 
 def test_what_is_linear_in_the_features_is_read_off_and_noise_is_not():
-    features, held = rng.normal(size=(400, 6)), rng.normal(size=(200, 6))
+    features, heldout = rng.normal(size=(400, 6)), rng.normal(size=(200, 6))
     weights = rng.normal(size=6)
 
     def targets(x):
         return np.stack([x @ weights + 3, rng.normal(size=len(x)), np.full(len(x), 2.0)], 1)
 
-    linear, noise, constant = ridge_r2(features, targets(features), held, targets(held))
+    linear, noise, constant = ridge_r2(features, targets(features), heldout, targets(heldout))
     assert linear > 0.99 and abs(noise) < 0.1 and np.isnan(constant)
 
 
@@ -50,6 +50,6 @@ def test_a_model_is_probed_on_episodes_that_it_was_not_fitted_on():
     (episode,) = watch("wpt/dmc-walker-stand-v0", 1, seed=3)
     width = model.policy.size.deter + model.policy.size.stoch * model.policy.size.classes
     assert latents(model, episode.trajectory).shape == (501, width)
-    found = list(probe(model, ["wpt/dmc-walker-stand-v0"], episodes=2))
-    assert [row["quantity"] for row in found] == list(QUANTITIES["walker"])
-    assert all(row["r2"] <= 1 for row in found)
+    probed = list(probe(model, ["wpt/dmc-walker-stand-v0"], episodes=2))
+    assert [row["quantity"] for row in probed] == list(QUANTITIES["walker"])
+    assert all(row["r2"] <= 1 for row in probed)

@@ -54,8 +54,8 @@ def test_a_stage_acts_as_soft_actor_critic_does():
     with torch.no_grad():
         expected = actor(many).numpy()
     quantiles = [0.1, 0.3, 0.5, 0.7, 0.9]
-    found = np.quantile(np.array(actions), quantiles)
-    np.testing.assert_allclose(found, np.quantile(expected, quantiles), atol=0.08)
+    drawn = np.quantile(np.array(actions), quantiles)
+    np.testing.assert_allclose(drawn, np.quantile(expected, quantiles), atol=0.08)
 
 
 def test_five_stages_are_recorded_in_turn_and_depend_on_the_seed_alone(tmp_path):

@@ -207,23 +207,23 @@ def test_a_change_of_fine_tuning_keeps_the_pretrained_model_and_others_do_not(tm
 
 
 def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
-    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
-    one = job(tmp_path, data=own)
+    data = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
+    one = job(tmp_path, data=data)
     assert one.shared.model_path != job(tmp_path).shared.model_path
     run(one)
-    assert TrajectoryDataset.open(own).fingerprint.startswith(one.config()["data"])
+    assert TrajectoryDataset.open(data).fingerprint.startswith(one.config()["data"])
     assert not list((tmp_path / "cache").glob("data-*"))
     path = one.shared.model_path
-    assert job(tmp_path, data=own.rename(tmp_path / "moved")).shared.model_path == path
+    assert job(tmp_path, data=data.rename(tmp_path / "moved")).shared.model_path == path
 
 
 def test_a_run_goes_on_with_the_same_data_alone(tmp_path):
-    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
-    run(job(tmp_path, data=own))
-    with TrajectoryDataset.open(own) as dataset:
+    data = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
+    run(job(tmp_path, data=data))
+    with TrajectoryDataset.open(data) as dataset:
         dataset.append(dataset[0])
     with pytest.raises(ValueError, match=r"other settings \(data\)"):
-        run(job(tmp_path, data=own))
+        run(job(tmp_path, data=data))
 
 
 def test_the_datas_name_is_as_it_was_written_wherever_a_run_is_done(tmp_path, monkeypatch):
@@ -253,10 +253,10 @@ def test_without_git_a_run_is_of_no_commit(monkeypatch):
 
 
 def test_data_of_another_look_than_the_tasks_are_told(tmp_path, capsys):
-    own = collect_data(job(tmp_path).shared).path
-    collect_data(job(tmp_path, data=own).shared)
+    data = collect_data(job(tmp_path).shared).path
+    collect_data(job(tmp_path, data=data).shared)
     assert "warning" not in capsys.readouterr().out
-    collect_data(job(tmp_path, data=own, env={"rendering": "near"}).shared)
+    collect_data(job(tmp_path, data=data, env={"rendering": "near"}).shared)
     assert "data of rendering=fast, but the task has rendering=near" in capsys.readouterr().out
 
 
@@ -418,10 +418,10 @@ def test_untrained_policies_are_told_once_however_many_methods_met_them():
         ("wpt", "last"),
     ]
     assert rows[0].seeds_low is None  # one seed
-    told = tables.policy_markdown(rows)
-    assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in told
-    assert "| scratch | 5.0 |" in told
-    assert "Seeds 0, 2 episodes each; commit abc." in told
+    table = tables.policy_markdown(rows)
+    assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in table
+    assert "| scratch | 5.0 |" in table
+    assert "Seeds 0, 2 episodes each; commit abc." in table
 
 
 def test_the_csv_reads_back_unrounded():
@@ -462,9 +462,9 @@ def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
 ):
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, *words) == 2
-    told = capsys.readouterr()
-    assert message in told.err
-    assert "Traceback" not in told.err and told.out == ""  # refused before anything is begun
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert "Traceback" not in printed.err and printed.out == ""  # refused before anything is begun
     assert list(tmp_path.iterdir()) == []
 
 
@@ -479,26 +479,26 @@ def test_every_command_has_help(command, monkeypatch, capsys):
 
 def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
     assert call(monkeypatch, "list", "--suite", "dmc") == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for word in ("dmc-quadruped-roll-fast", "demo", "no-rehearsal"):
-        assert word in told
-    assert "metaworld-" not in told
+        assert word in printed
+    assert "metaworld-" not in printed
 
 
 def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "walker-run", "cheetah-*", "--seeds", "2", "--out", tmp_path / "runs"]
     assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
-    told = capsys.readouterr().out
-    assert told.count("dmc-cheetah-run-back ") == 2
-    assert "6 episodes to collect" in told and " runs to do" in told
+    printed = capsys.readouterr().out
+    assert printed.count("dmc-cheetah-run-back ") == 2
+    assert "6 episodes to collect" in printed and " runs to do" in printed
     assert not (tmp_path / "runs").exists()
 
 
 def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
     assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
-    told = capsys.readouterr()
-    assert "1 of 1 run to do" in told.out and "--device cuda:99" in told.err
+    printed = capsys.readouterr()
+    assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
 
 
 def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):
@@ -515,8 +515,8 @@ def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys
 def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
     assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0
-    told = capsys.readouterr().out
-    assert "embodiment" in told and "Dataset:" in told and "{" not in told
+    printed = capsys.readouterr().out
+    assert "embodiment" in printed and "Dataset:" in printed and "{" not in printed
 
 
 def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
@@ -529,8 +529,8 @@ def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "report", tmp_path) == 0
     assert "dmc-dot" in capsys.readouterr().out
     assert call(monkeypatch, "report", tmp_path, "--markdown") == 0
-    told = capsys.readouterr().out
-    assert all(f"| {name} |" in told for name in ("doing nothing", "prior actor", "wpt"))
+    printed = capsys.readouterr().out
+    assert all(f"| {name} |" in printed for name in ("doing nothing", "prior actor", "wpt"))
     assert call(monkeypatch, "report", tmp_path, "--csv") == 0
     assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")
 
@@ -543,18 +543,18 @@ def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp
 
 
 def test_runs_of_a_changed_preset_are_told_apart(tmp_path):
-    given = "dmc", ["walker-stand"], "debug", "1", ["wpt"]
+    arguments = "dmc", ["walker-stand"], "debug", "1", ["wpt"]
     plain, changed, longer = (
-        str(make_plan(*given, settings, tmp_path, 1, "cpu")[0].variant)
+        str(make_plan(*arguments, settings, tmp_path, 1, "cpu")[0].variant)
         for settings in ([], ["gamma=0.9", "env.rendering=near"], ["learn.frames=9000"])
     )
     assert (plain, changed, longer) == ("debug", "debug env.rendering=near gamma=0.9", "debug")
 
 
 def test_data_that_have_grown_are_pretrained_on_anew(tmp_path):
-    own = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
-    before = job(tmp_path, data=own).shared.model_path
-    assert job(tmp_path, data=own).shared.model_path == before
-    with TrajectoryDataset.open(own) as dataset:
+    data = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
+    before = job(tmp_path, data=data).shared.model_path
+    assert job(tmp_path, data=data).shared.model_path == before
+    with TrajectoryDataset.open(data) as dataset:
         dataset.append(dataset[0])
-    assert job(tmp_path, data=own).shared.model_path != before
+    assert job(tmp_path, data=data).shared.model_path != before

@@ -131,13 +131,13 @@ def test_each_axis_of_the_grid_holds_all_else_equal():
 
 
 def test_the_memory_of_a_row_is_its_own():
-    def held(numbers):
+    def peak(numbers):
         timing.forget_peak()
         before = timing.peak_rss_mb()
         torch.ones(numbers)
         return timing.peak_rss_mb() - before
 
-    big, small = held(64 * 2**18), held(2**18)  # 64 and 1 MB of float32
+    big, small = peak(64 * 2**18), peak(2**18)  # 64 and 1 MB of float32
     assert big > 60
     if sys.platform == "linux":  # elsewhere the system does not forget
         assert small < 20
@@ -167,9 +167,9 @@ def test_a_table_shortens_nothing(monkeypatch, capsys):
     monkeypatch.setattr(Console, "size", ConsoleDimensions(60, 25))
     task = "metaworld-button-press-topdown-wall"
     print_table("envs", [{"what": "step", "task": task, "a_long_heading_of_a_column": 1}])
-    told = capsys.readouterr().out
-    joined = "".join(c for c in told if c.isalnum() or c in "-_")
-    assert max(map(len, told.splitlines())) <= 60 and "…" not in told
+    printed = capsys.readouterr().out
+    joined = "".join(c for c in printed if c.isalnum() or c in "-_")
+    assert max(map(len, printed.splitlines())) <= 60 and "…" not in printed
     assert all(part in joined for part in ("button-press", "wall", "heading"))
 
 

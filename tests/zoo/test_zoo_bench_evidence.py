@@ -13,10 +13,10 @@ pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
 def states(*places):
     """Walker states of (height, pitch, speed)."""
-    found = np.zeros((len(places), 24))
-    for state, (height, pitch, speed) in zip(found, places, strict=True):
+    rows = np.zeros((len(places), 24))
+    for state, (height, pitch, speed) in zip(rows, places, strict=True):
         state[[0, 1, 14, 16]] = np.cos(pitch), np.sin(pitch), height, speed
-    return found
+    return rows
 
 
 def test_coverage_counts_each_cell_once_and_what_lies_outside_at_the_edge():
@@ -59,9 +59,9 @@ def test_shares_count_the_querys_own_kind_among_the_nearest(tmp_path):
 
 
 def test_the_index_is_built_and_searched_at_the_size_asked_for():
-    found = retrieval.index_cost(300, 8)
-    assert found["features"] == "index of 300 x 8"
-    assert 0 < found["of which imports"] <= found["peak MiB"]
+    cost = retrieval.index_cost(300, 8)
+    assert cost["features"] == "index of 300 x 8"
+    assert 0 < cost["of which imports"] <= cost["peak MiB"]
 
 
 def test_every_row_of_the_retrieval_bench_is_made(tmp_path, monkeypatch):

@@ -53,13 +53,13 @@ def test_the_error_is_the_one_that_pre_training_minimises():
 
 def test_a_model_dreams_the_same_at_every_call_and_sees_the_context_alone():
     batch = prediction.windows(clock(50), 1, 4)
-    told = prediction.dream(agent())(batch)
-    assert told.shape == batch.image.shape and told.dtype == np.uint8
+    dreamt = prediction.dream(agent())(batch)
+    assert dreamt.shape == batch.image.shape and dreamt.dtype == np.uint8
     later = batch.image.clone()
     later[:, prediction.CONTEXT :] = 255
-    assert np.array_equal(told, prediction.dream(agent())(replace(batch, image=later)))
+    assert np.array_equal(dreamt, prediction.dream(agent())(replace(batch, image=later)))
     later[:, prediction.CONTEXT - 1] = 255
-    assert not np.array_equal(told, prediction.dream(agent())(replace(batch, image=later)))
+    assert not np.array_equal(dreamt, prediction.dream(agent())(replace(batch, image=later)))
 
 
 def test_the_last_episodes_of_each_task_are_held_out(tmp_path):
@@ -103,13 +103,13 @@ def test_the_mean_frame_is_that_of_all_training_images_and_never_changes(tmp_pat
 
 
 def test_a_row_counts_horizons_from_1_and_compares_within_trajectories():
-    found = np.zeros((2, 41))
-    found[0, 1:], found[1, 1:], found[:, 0] = 2, 6, 99  # horizon 0 is no prediction
-    told = prediction.row("arm", "x", found, found + 3)
-    assert told["mean of 1 to 40"] == told["+1"] == told["+40"] == 4
-    assert told["95 %"] == "2.0 to 6.0" and told["episodes"] == 2
+    errors = np.zeros((2, 41))
+    errors[0, 1:], errors[1, 1:], errors[:, 0] = 2, 6, 99  # horizon 0 is no prediction
+    row = prediction.row("arm", "x", errors, errors + 3)
+    assert row["mean of 1 to 40"] == row["+1"] == row["+40"] == 4
+    assert row["95 %"] == "2.0 to 6.0" and row["episodes"] == 2
     # both trajectories are 3 below copying: paired, there is nothing left to chance
-    assert told["minus copying"] == -3 and told["95 % "] == "-3.0 to -3.0"
+    assert row["minus copying"] == -3 and row["95 % "] == "-3.0 to -3.0"
 
 
 def test_the_typical_window_moves_neither_most_nor_least():
@@ -133,8 +133,8 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
     rows = [json.loads(line) for line in ran.stdout.splitlines()]
     five = ["generalist", "specialist", "untrained", "copy last frame", "mean frame"]
     more = ["left out", "left out, then 1 updates", "from scratch, 1 updates"]
-    told = {robot: [r["prediction"] for r in rows if r["robot"] == robot] for robot in ROBOTS}
-    assert told == {"walker": five + more, "cartpole": five}
+    predicted = {robot: [r["prediction"] for r in rows if r["robot"] == robot] for robot in ROBOTS}
+    assert predicted == {"walker": five + more, "cartpole": five}
     assert all(row["+1"] >= 0 and row["episodes"] == 2 for row in rows)
     folder = tmp_path / bench.QUICK.folder
     table = pd.read_csv(folder / "prediction.csv")
@@ -147,8 +147,8 @@ def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path,
         *("left-out", "left-out-2-then", "scratch-1"),
     }
     again = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--json"])
-    found = [json.loads(line) for line in again.stdout.splitlines()]
-    assert [row | {"rss_mb": 0} for row in found] == [row | {"rss_mb": 0} for row in rows]
+    repeated = [json.loads(line) for line in again.stdout.splitlines()]
+    assert [row | {"rss_mb": 0} for row in repeated] == [row | {"rss_mb": 0} for row in rows]
     assert {path: path.stat().st_mtime_ns for path in before} == before
     fewer = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--updates", "1"])
     assert isinstance(fewer.exception, ValueError)

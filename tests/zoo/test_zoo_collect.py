@@ -125,8 +125,8 @@ def test_half_a_dataset_is_continued_to_the_same_data(tmp_path, monkeypatch):
 def test_what_another_process_has_collected_meanwhile_is_not_collected_again(tmp_path, monkeypatch):
     opened = module._open
 
-    def opened_long_before(path, told):
-        dataset = opened(path, told)
+    def opened_long_before(path, description):
+        dataset = opened(path, description)
         monkeypatch.setattr(module, "_open", opened)
         collect(tmp_path, [DOT], 3)  # the other process, from beginning to end
         return dataset
@@ -214,12 +214,12 @@ def test_a_dataset_that_collect_did_not_make_is_left_alone(tmp_path):
 
 def test_the_label_tells_how_to_make_the_data_again(tmp_path):
     collect(tmp_path / "data", [DOT], 1, seed=7, workers=1, progress_bar=False)
-    told = json.loads((tmp_path / "data" / "collect.json").read_text())
-    assert (told["tasks"], told["episodes"], told["seed"]) == ([DOT], 1, 7)
+    label = json.loads((tmp_path / "data" / "collect.json").read_text())
+    assert (label["tasks"], label["episodes"], label["seed"]) == ([DOT], 1, 7)
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"tasks": []}, "different tasks"),
         ({"tasks": [DOT, DOT]}, "different tasks"),
@@ -232,9 +232,11 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),
     ],
 )
-def test_what_cannot_be_collected_is_refused_before_anything_is_written(tmp_path, given, message):
+def test_what_cannot_be_collected_is_refused_before_anything_is_written(
+    tmp_path, arguments, message
+):
     with pytest.raises(ValueError, match=message):
-        collect(tmp_path / "data", **({"tasks": [DOT], "episodes": 1} | given))
+        collect(tmp_path / "data", **({"tasks": [DOT], "episodes": 1} | arguments))
     assert not (tmp_path / "data").exists()
 
 
@@ -253,8 +255,8 @@ def test_scripts_are_noised_from_episode_to_episode(tmp_path):
 def test_a_saved_policy_is_noised_from_episode_to_episode(tmp_path):
     model = agent(gym.make(DOT), embodiment="dot")
     model.save(tmp_path / "dot.zip")
-    given = {"behaviour": "policy", "policy": str(tmp_path / "dot.zip"), "sigmas": [0.0, 0.5]}
-    data = collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False, **given)
+    arguments = {"behaviour": "policy", "policy": str(tmp_path / "dot.zip"), "sigmas": [0.0, 0.5]}
+    data = collect(tmp_path / "data", [DOT], 3, workers=1, progress_bar=False, **arguments)
     names = [f"policy dot.zip, sigma {sigma}" for sigma in (0.0, 0.5, 0.0)]
     assert [t.source for t in data] == names
     env, state = gym.make(DOT), None
@@ -363,7 +365,7 @@ def test_a_curious_agent_killed_while_its_folder_is_made_goes_on(tmp_path):
 def test_by_default_the_papers_meta_world_data_are_collected(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        module, "collect", lambda *given, **more: asked.append((given, more)) or stop()
+        module, "collect", lambda *arguments, **more: asked.append((arguments, more)) or stop()
     )
     call(monkeypatch, "collect", "--suite", "metaworld", "--out", tmp_path)
     [((_, tasks, number, seed, _, behaviour, _), more)] = asked
@@ -382,7 +384,7 @@ def test_the_command_collects_with_what_it_is_given(tmp_path, monkeypatch):
     words = ["--tasks", "walker-stand", "--behaviour", "icm", "--episodes", 7]
     asked = []
     monkeypatch.setattr(
-        module, "collect", lambda *given, **more: asked.append((given, more)) or stop()
+        module, "collect", lambda *arguments, **more: asked.append((arguments, more)) or stop()
     )
     call(monkeypatch, "collect", "--out", tmp_path, *words, "--set", "size=debug", "gamma=0.9")
     [((_, tasks, episodes, _, _, behaviour, _), more)] = asked

@@ -1,4 +1,4 @@
-"""Engines: every run is done once, whatever its worker dies of, and what cannot be done is told."""
+"""Engines: every run is done once, whatever kills its worker, and failures are reported."""
 
 import os
 import pickle
@@ -121,8 +121,10 @@ def test_no_engine_is_imported_unless_asked_for():
     import subprocess
 
     code = "import sys, wpt_agents.zoo.run.engines; print({'ray', 'submitit'} & sys.modules.keys())"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "set()"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "set()"
 
 
 @pytest.fixture(scope="module")

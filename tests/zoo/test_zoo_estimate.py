@@ -1,4 +1,4 @@
-"""Time and room are told before work begins, and too little room ends it there."""
+"""Time and disk space are estimated before work starts, and too little space stops it."""
 
 import shutil
 from collections import namedtuple

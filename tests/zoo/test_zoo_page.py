@@ -49,9 +49,9 @@ class Reader(HTMLParser):
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attributes):
-        given = dict(attributes)
-        self.links += [given[key] for key in ("src", "href", "xlink:href") if key in given]
-        self.ids += [given["id"]] if "id" in given else []
+        values = dict(attributes)
+        self.links += [values[key] for key in ("src", "href", "xlink:href") if key in values]
+        self.ids += [values["id"]] if "id" in values else []
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -94,9 +94,9 @@ def test_budgets_seeds_and_commits_stand_in_the_cells_where_they_differ(tmp_path
     for seed in range(2):
         make_run(tmp_path, "dmc-cheetah-run", seed)
     write_page(tmp_path, tmp_path / "index.html")
-    told = text((tmp_path / "index.html").read_text())
-    assert "1,000 frames, seeds 0, commit 0123456789ab" in told
-    assert "1,000 frames, seeds 0, 1, commit 0123456789ab" in told
+    page = text((tmp_path / "index.html").read_text())
+    assert "1,000 frames, seeds 0, commit 0123456789ab" in page
+    assert "1,000 frames, seeds 0, 1, commit 0123456789ab" in page
 
 
 def test_budgets_seeds_and_commits_stand_at_the_columns_head_where_they_agree():
@@ -125,13 +125,13 @@ def test_one_seed_has_no_interval_and_the_page_says_so(tmp_path):
     make_run(tmp_path, "dmc-walker-run", 0, "wpt", (700.0, 760.0))
     make_run(tmp_path, "dmc-walker-run", 0, "scratch", (90.0, 110.0))
     write_page(tmp_path, tmp_path / "index.html")
-    told = text((tmp_path / "index.html").read_text())
-    assert "0.73 to 0.73" not in told
-    assert "1 of 22 1 0.73 no interval 0.73 no interval" in told
-    assert "scratch 1.00 no interval 1" in told  # probability of improvement
-    assert "730 one seed: no interval" in told
-    assert "One seed per task: no interval over seeds" in told
-    assert "No run of the method" not in told
+    page = text((tmp_path / "index.html").read_text())
+    assert "0.73 to 0.73" not in page
+    assert "1 of 22 1 0.73 no interval 0.73 no interval" in page
+    assert "scratch 1.00 no interval 1" in page  # probability of improvement
+    assert "730 one seed: no interval" in page
+    assert "One seed per task: no interval over seeds" in page
+    assert "No run of the method" not in page
 
 
 def test_misprints_of_the_paper_are_marked_with_what_the_rows_give(page):
@@ -151,14 +151,14 @@ def test_which_printed_aggregates_do_not_follow_from_their_rows():
 
 
 def test_aggregates_profiles_curves_ablation_and_improvement_are_there(page):
-    told = text(page)
+    shown = text(page)
     # walker-run: 0.73 in both seeds; the paper's on the same task 0.728
-    assert "wpt debug, 1,000 frames 1 of 22 2 0.73 0.73 to 0.73" in told
-    assert "scratch 1.00 1.00 to 1.00 1" in told  # probability of improvement, tasks in common
+    assert "wpt debug, 1,000 frames 1 of 22 2 0.73 0.73 to 0.73" in shown
+    assert "scratch 1.00 1.00 to 1.00 1" in shown  # probability of improvement, tasks in common
     titles = re.findall(r'aria-label="([^"]*)"', page)
     assert "DMControl: performance profile" in titles and "metaworld-reach" in titles
     assert "DMControl: ablation, debug, 1,000 frames" in titles
-    assert "Mean of the two suites" in told
+    assert "Mean of the two suites" in shown
 
 
 def test_every_run_shows_its_command_seed_commit_and_the_first_its_pictures(page):
@@ -199,8 +199,8 @@ def test_figures_are_whole_svg_in_the_pages_colours():
 
 def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
     tasks = ["dmc-walker-run", "dmc-walker-stand"]  # 728.0 and 969.4 in Table 5
-    given = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
-    assert given.mean == pytest.approx((0.728 + 0.9694) / 2)
+    aggregate = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
+    assert aggregate.mean == pytest.approx((0.728 + 0.9694) / 2)
     assert aggregates.paper_aggregate("dmc", tasks, "no-rehearsal", 150_000) is None
 
 
@@ -226,8 +226,8 @@ def test_the_headline_compares_successes_where_they_are_the_score(tmp_path):
     for seed in range(3):  # 4.9 and less is no success
         make_run(tmp_path, "metaworld-reach", seed, "wpt", (4.9 - seed / 100, 4.9))
         make_run(tmp_path, "metaworld-reach", seed, "scratch", (0.0, 5.1 + seed / 100))
-    [told] = headline.headlines(read_results(tmp_path))
-    against = {each.policy: (each.above, each.below) for each in told.against}
+    [line] = headline.headlines(read_results(tmp_path))
+    against = {rival.policy: (rival.above, rival.below) for rival in line.against}
     assert against == {"random policy": (0, 0), "prior actor": (0, 0), "same, from scratch": (0, 1)}
 
 
@@ -235,8 +235,8 @@ def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
     make_run(tmp_path / "a", "metaworld-reach", returns=(9.0, 1.0))
     make_run(tmp_path / "b", "dmc-walker-run", returns=(100.0, 100.0), frames=1000)
     make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
-    [told] = headline.both_suites(read_results(tmp_path))
-    assert told.ours == pytest.approx((0.5 + 0.1) / 2)
+    [line] = headline.both_suites(read_results(tmp_path))
+    assert line.ours == pytest.approx((0.5 + 0.1) / 2)
 
 
 def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):

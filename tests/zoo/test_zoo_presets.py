@@ -48,8 +48,8 @@ def test_the_paper_preset_is_table_2():
 
 def test_frames_become_calls_of_step_by_the_action_repeat():
     assert load_preset("dmc", "debug", ["learn.frames=150_000"]).steps == 75_000
-    given = ["learn.frames=150_000", "env.action_repeat=4"]
-    assert load_preset("dmc", "debug", given).steps == 37_500
+    settings = ["learn.frames=150_000", "env.action_repeat=4"]
+    assert load_preset("dmc", "debug", settings).steps == 37_500
 
 
 def test_settings_change_keywords_and_sections():
@@ -216,10 +216,10 @@ def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
     assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "pretrain-only", settings)
     with TrajectoryDataset.create(tmp_path / "own") as dataset:
         dataset.append(recorded(actions=12))
-    own = dict(settings=settings, data=tmp_path / "own")
-    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, **own)
+    arguments = dict(settings=settings, data=tmp_path / "own")
+    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, **arguments)
     with pytest.raises(ValueError, match=r"walker-walk has 6 actions.*\(12\)"):
-        plan("dmc", ["walker-walk"], "demo", tmp_path, **own)
+        plan("dmc", ["walker-walk"], "demo", tmp_path, **arguments)
 
 
 def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
@@ -230,11 +230,11 @@ def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "message"),
     [("retrieval=nearst", "nearest"), ("guidance=foo", "guidance='foo'"), ("size=tny", "tiny")],
 )
-def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, told, tmp_path):
-    with pytest.raises(ValueError, match=told):
+def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
         plan("dmc", ["walker-walk"], "demo", tmp_path, settings=[setting])
 
 
@@ -262,8 +262,8 @@ def test_what_a_run_would_stumble_over_or_overrule_is_refused_beforehand(
 
 def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_path):
     methods, settings = ["scratch", "scratch"], ["gamma=0.98", "gamma=0.9"]
-    given = "dmc", ["walker-run"], "debug", "1", methods, settings
-    [one] = make_plan(*given, tmp_path, 1, "cpu")
+    arguments = "dmc", ["walker-run"], "debug", "1", methods, settings
+    [one] = make_plan(*arguments, tmp_path, 1, "cpu")
     assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
 
 

@@ -28,7 +28,7 @@ def line(method, score, task="dmc-a", seed=0, frames=100, suite="dmc", preset="t
 def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
     make_run(tmp_path, "dmc-walker-run", seed=2, returns=(300.0, 500.0), preset="tiny size=debug")
     make_run(tmp_path, "metaworld-reach", returns=(3.0, 9.0, 9.0, 9.0), method="no-pretrain")
-    lines = {(each.task, each.method): each for each in lines_of(tmp_path)}
+    lines = {(entry.task, entry.method): entry for entry in lines_of(tmp_path)}
     walker = lines["dmc-walker-run", "wpt"]
     assert (walker.score, walker.return_, walker.success) == (40, 400, None)
     assert (walker.hours, walker.commit) == (pytest.approx(2 / 3600, abs=1e-4), "0123456789ab")
@@ -50,8 +50,8 @@ def result(method="wpt", preset="tiny", scores=()):
 
 def test_data_of_ones_own_are_in_the_command():
     changes = "data=my/own 'collect.tasks=[a, b]' 'guidance=linear(1,0,9)'"
-    told = result(preset=f"tiny {changes}").command
-    assert told.endswith(
+    command = result(preset=f"tiny {changes}").command
+    assert command.endswith(
         "--set 'collect.tasks=[a, b]' --set 'guidance=linear(1,0,9)' --data my/own"
     )
 
@@ -61,15 +61,15 @@ def test_policies_in_between_and_of_other_methods_have_names_of_their_own():
     assert policy_name(kept, "last") == "wpt, last" and policy_name(kept, "best") == "wpt"
     assert policy_name(kept, "after head start") == "wpt, after head start"
     names = [("last", "scratch"), ("prior actor", "no-pretrain"), ("random", "scratch")]
-    told = [policy_name(result(method, scores=["last"]), policy) for policy, method in names]
-    assert told == ["scratch", "prior actor, no-pretrain", "random"]
+    policies = [policy_name(result(method, scores=["last"]), policy) for policy, method in names]
+    assert policies == ["scratch", "prior actor, no-pretrain", "random"]
     assert policy_name(result("kickstart"), "prior actor") == "prior actor"  # the clone of wpt
 
 
 def test_untrained_policies_are_told_apart_by_how_they_are_played(tmp_path):
     for preset in ("demo", "debug", "demo size=tiny", "demo evaluate.episodes=3"):
         make_run(tmp_path, "dmc-walker-run", method="scratch", preset=preset)
-    lines = [str(each.preset) for each in lines_of(tmp_path) if each.method == "random"]
+    lines = [str(entry.preset) for entry in lines_of(tmp_path) if entry.method == "random"]
     assert lines == ["debug", "demo", "demo evaluate.episodes=3"]
 
 
@@ -77,8 +77,8 @@ def test_budgets_are_kept_apart_where_there_is_no_run_of_wpt():
     lines = [line("scratch", 10.0, frames=100), line("scratch", 90.0, frames=300)]
     lines += [line("scratch", 50.0, frames=900, preset="small"), line("random", 1.0, frames=0)]
     means = record_tables.by_suite(lines)
-    found = {method: cell.mean for method, suites in means.items() for _, cell in suites.values()}
-    assert found == {
+    scores = {method: cell.mean for method, suites in means.items() for _, cell in suites.values()}
+    assert scores == {
         **{"random": 1.0, "scratch": 10.0, "scratch, 3x frames": 90.0},
         "scratch, 9x frames, small": 50.0,
     }
@@ -97,7 +97,7 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     first = [line("wpt", 1.5), line("wpt", 2.0, seed=1)]
     assert record.update(path, first) == record.read(path) == first
     again = record.update(path, [line("wpt", 9.0, seed=1), line("scratch", 3.0)])
-    assert [(each.method, each.score) for each in again] == [
+    assert [(entry.method, entry.score) for entry in again] == [
         *[("scratch", 3.0), ("wpt", 1.5), ("wpt", 9.0)]
     ]
     assert path.read_text().splitlines()[0] == (
@@ -108,7 +108,7 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
 
 def test_presets_are_kept_apart():
     lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
-    assert len({each.run for each in lines}) == 3
+    assert len({entry.run for entry in lines}) == 3
     assert set(record_tables.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
     assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record_tables.markdown(lines)
 
@@ -125,16 +125,16 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
         *[line("wpt", score, "mw-a", seed, 50, "mw") for seed, score in enumerate((80.0, 100.0))],
         *[line("scratch", 30.0, "mw-a", 0, 150, "mw"), line("random", 7.0, "mw-a", 0, 0, "mw")],
     ]
-    found = record_tables.by_suite(lines)
-    assert found["wpt"]["dmc"][0] == 3 and found["wpt"]["mw"][1].mean == 90
-    both = found["wpt"]["both"][1]
+    suites = record_tables.by_suite(lines)
+    assert suites["wpt"]["dmc"][0] == 3 and suites["wpt"]["mw"][1].mean == 90
+    both = suites["wpt"]["both"][1]
     assert (both.mean, both.low, both.high) == (45, 40, 50)
-    assert found["scratch, 3x frames"]["mw"][1].low is None  # of one seed
+    assert suites["scratch, 3x frames"]["mw"][1].low is None  # of one seed
     fewer = record_tables.by_suite(
-        [each for each in lines if (each.task, each.seed) != ("dmc-0", 1)]
+        [entry for entry in lines if (entry.task, entry.seed) != ("dmc-0", 1)]
     )
     assert fewer["wpt"]["mw"][1].low == 80 and fewer["wpt"]["both"][1].low is None  # one of them
-    assert set(found) == {"wpt", "scratch, 3x frames", "random"} and "both" not in found["random"]
+    assert set(suites) == {"wpt", "scratch, 3x frames", "random"} and "both" not in suites["random"]
 
 
 def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
@@ -166,25 +166,25 @@ def test_three_suites_have_no_mean_of_both():
 
 def test_the_pages_rows_are_the_records():
     root = Path(__file__).parents[2]
-    told = record_tables.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
-    assert told == (root / "zoo" / "results" / "small-benchmark.md").read_text()
+    table = record_tables.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
+    assert table == (root / "zoo" / "results" / "small-benchmark.md").read_text()
     page = (root / "docs" / "small-benchmark.md").read_text().splitlines()
     rows = [line for line in page if line.startswith(("| dmc", "| metaworld", "| both |"))]
-    assert len(rows) > 30 and set(rows) <= set(told.splitlines())
+    assert len(rows) > 30 and set(rows) <= set(table.splitlines())
 
 
 def test_methods_are_told_from_doing_nothing_to_ours():
     assert set(METHODS) < set(record.ORDER)
-    told = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
-    lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(told)]
+    order = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]
+    lines = [line(method, 1.0, task=task) for task in "ba" for method in reversed(order)]
     shown = sorted(lines, key=record.order)
-    assert [(x.task, x.method) for x in shown] == [(task, m) for task in "ab" for m in told]
+    assert [(x.task, x.method) for x in shown] == [(task, m) for task in "ab" for m in order]
     assert list(record_tables.by_suite(lines)) == [
         "nothing",
         "scratch",
         "wpt, last",
         "wpt",
-        *told[4:],
+        *order[4:],
     ]
 
 

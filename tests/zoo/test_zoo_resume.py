@@ -64,13 +64,13 @@ def killed_at(step, monkeypatch, one):
 def left(folder):
     """All that a run leaves, clocks apart."""
     _, tensors = read_model(folder / "model.zip")
-    flat = {f"{g}/{k}": v.numpy() for g, each in tensors.items() for k, v in each.items()}
+    flat = {f"{g}/{k}": v.numpy() for g, group in tensors.items() for k, v in group.items()}
     rows = np.genfromtxt(folder / "progress.csv", delimiter=",", names=True)
     flat |= {n: rows[n] for n in rows.dtype.names if n != "timefps"}
     monitor = np.genfromtxt(folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
     flat |= {"returns": monitor["r"], "lengths": monitor["l"]}
-    with np.load(folder / "evaluations.npz") as held:
-        flat |= {n: held[n] for n in held.files}
+    with np.load(folder / "evaluations.npz") as arrays:
+        flat |= {n: arrays[n] for n in arrays.files}
     scores = json.loads((folder / "result.json").read_text())["scores"]
     return flat | {name: np.array(score["returns"]) for name, score in scores.items()}
 
@@ -131,8 +131,8 @@ def test_what_came_after_the_checkpoint_is_forgotten(tmp_path, monkeypatch):
     checkpoint = last_checkpoint(one.folder)
     checkpoint.restore_logs(one.folder)
     assert (one.folder / "0.monitor.csv").read_text().count("\n") == 2 + 3
-    with np.load(one.folder / "evaluations.npz") as held:
-        assert held["timesteps"].tolist() == [25, 50, 75]
+    with np.load(one.folder / "evaluations.npz") as arrays:
+        assert arrays["timesteps"].tolist() == [25, 50, 75]
     model = WPT.load(checkpoint.model)
     model.set_logger(configure(str(tmp_path / "log"), []))
     assert len(list((one.folder / "replay").iterdir())) == 4

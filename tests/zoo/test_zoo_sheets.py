@@ -52,8 +52,12 @@ def test_what_is_shown_is_of_every_kind_first(dataset):
 
 def test_data_show_prints_the_table_and_draws_the_images(dataset, tmp_path, monkeypatch, capsys):
     assert call(monkeypatch, "data", "show", dataset.path, "--out", tmp_path / "sheet.png") == 0
-    told = capsys.readouterr().out
-    assert "arm" in told and "37" in told and str(tmp_path / "sheet.png") in told.replace("\n", "")
+    printed = capsys.readouterr().out
+    assert (
+        "arm" in printed
+        and "37" in printed
+        and str(tmp_path / "sheet.png") in printed.replace("\n", "")
+    )
     assert {(200, 0, 0), (200, 0, 10), (30, 30, 30)} <= colours(tmp_path / "sheet.png")
 
 
@@ -108,7 +112,7 @@ def test_datasets_are_checked_and_joined_from_a_terminal(tmp_path, monkeypatch, 
     shard = next(both.glob("shard-*.bin"))
     shard.write_bytes(shard.read_bytes()[:-50])  # the last trajectory's end
     assert call(monkeypatch, "data", "validate", both) == 1
-    told = capsys.readouterr().out
-    assert "trajectory 3" in told and "4 trajectories read, 1 damaged" in told
+    printed = capsys.readouterr().out
+    assert "trajectory 3" in printed and "4 trajectories read, 1 damaged" in printed
     assert not call(monkeypatch, "data", "validate", both, "--set-aside")
     assert len(TrajectoryDataset.open(both)) == 3

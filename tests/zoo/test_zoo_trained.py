@@ -49,8 +49,8 @@ def test_a_moved_run_without_its_data_plays_as_it_did(moved):
 def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     folder, _, seed = moved
     assert call(monkeypatch, "eval", folder, "--episodes", "2", "--seed", seed) == 0
-    told = capsys.readouterr().out
-    assert re.search(r"returns +-?\d", told) and DOT.id in told
+    printed = capsys.readouterr().out
+    assert re.search(r"returns +-?\d", printed) and DOT.id in printed
     video = tmp_path / "new" / "video.mp4"
     assert call(monkeypatch, "enjoy", folder, "--out", video, "--size", "64") == 0
     assert count_frames_and_secs(video)[0] >= DOT.frames
@@ -72,12 +72,12 @@ def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
     folder, _, seed = moved
     words = ["--episodes", "2", "--horizon", "10", "--seed", seed]
     assert call(monkeypatch, "diagnose", folder, *words) == 0
-    told = capsys.readouterr().out
-    assert all(word in told for word in ("earned", "dream of the actor", "discounted return"))
-    rows = re.findall(r"│ +(\d+) │ +(-?[\d.]+) │", told)
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("earned", "dream of the actor", "discounted return"))
+    rows = re.findall(r"│ +(\d+) │ +(-?[\d.]+) │", printed)
     assert [int(step) for step, _ in rows] == [0, 3, 7, 11, 15]  # five from 0 to 25 - 10
     returns = find_trained(folder).evaluate(find_trained(folder).load(), 1, seed).returns
-    assert re.search(rf"Returns: {returns[0]:.0f}, ", told)
+    assert re.search(rf"Returns: {returns[0]:.0f}, ", printed)
     assert call(monkeypatch, "diagnose", folder, "--horizon", "26") == 2
     assert "shorter --horizon" in capsys.readouterr().err
 
@@ -94,13 +94,13 @@ def test_promises_are_of_the_actions_and_rewards_from_the_start_on(monkeypatch):
     imagine = rssm.imagine
     monkeypatch.setattr(rssm, "imagine", noted)
     played = Trajectory(noise(7), action, reward)
-    found = promises(policy, played, 0.5, [0, 4], 2)
-    assert [(p.start, p.earned) for p in found] == [(0, 0.5), (4, 4.5)]
+    rows = promises(policy, played, 0.5, [0, 4], 2)
+    assert [(p.start, p.earned) for p in rows] == [(0, 0.5), (4, 4.5)]
     # what the critic is taught: image t came with reward t - 1, and the last one pays no more
     arriving = torch.tensor([[0, *reward.tolist()]])
     returns = lambda_return(arriving, torch.zeros(1, 8), 0.5, lam=1.0)[0]
-    assert [p.discounted for p in found] == pytest.approx([returns[0].item(), returns[4].item()])
-    assert found[1].discounted == 3 + 0.5 * 4 + 0.25 * 5
+    assert [p.discounted for p in rows] == pytest.approx([returns[0].item(), returns[4].item()])
+    assert rows[1].discounted == 3 + 0.5 * 4 + 0.25 * 5
     np.testing.assert_array_equal(taken[0][0], action[:2])
     np.testing.assert_array_equal(taken[2][0], action[4:])  # taken[1] are the actor's own
     assert not np.array_equal(taken[1][0], action[:2])
@@ -134,8 +134,8 @@ def test_what_cannot_be_played_is_told(words, message, tmp_path, monkeypatch, ca
     (tmp_path / "alone.zip").touch()
     for name in ("run", "damaged"):
         (tmp_path / name / "model.zip").touch()
-    about = {"task": "wpt/dmc-walker-run-v0", "env": {}}
-    (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(about))
+    config = {"task": "wpt/dmc-walker-run-v0", "env": {}}
+    (tmp_path / "run" / "config.yaml").write_text(yaml.safe_dump(config))
     (tmp_path / "damaged" / "config.yaml").write_text("task: [")
     assert call(monkeypatch, *words) == 2
     assert message in capsys.readouterr().err
@@ -148,15 +148,15 @@ def test_the_hub_is_asked_for_only_when_needed_and_told_if_missing(tmp_path, mon
 
 
 def test_the_card_tells_scores_command_and_how_to_load(tmp_path):
-    told = card(
+    page = card(
         read_result(make_run(tmp_path, "dmc-walker-run", 3, returns=(700.0, 720.0))), "me/walker"
     )
-    about = yaml.safe_load(told.split("---\n")[1])
-    (result,) = about["model-index"][0]["results"]
+    header = yaml.safe_load(page.split("---\n")[1])
+    (result,) = header["model-index"][0]["results"]
     assert result["metrics"][0]["value"] == 710.0
-    assert about["library_name"] == "wpt-agents"
+    assert header["library_name"] == "wpt-agents"
     for text in ("| wpt | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
-        assert text in told
+        assert text in page
 
 
 def test_what_was_pushed_is_pulled_the_same(tmp_path, hub):  # noqa: F811
@@ -166,7 +166,7 @@ def test_what_was_pushed_is_pulled_the_same(tmp_path, hub):  # noqa: F811
     config = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(config + f"data: {tmp_path}\n")
     address = push(folder, "me/walker")
-    assert not any(str(tmp_path).encode() in told for told in hub.files["me/walker"].values())
+    assert not any(str(tmp_path).encode() in content for content in hub.files["me/walker"].values())
     (folder / "config.yaml").write_text(config)
     assert address.endswith("me/walker")
     assert {"README.md", "replay.mp4", "model.zip", "result.json"} <= hub.files["me/walker"].keys()

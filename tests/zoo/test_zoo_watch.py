@@ -53,7 +53,7 @@ def test_a_line_half_written_is_left_for_later(tmp_path):
 def test_speed_counts_since_the_process_began_again():
     lengths = np.full(4, 100.0)
     assert speed(lengths, np.array([10, 20, 30, 40])) == 10
-    assert speed(lengths, np.array([90, 100, 4, 8])) == 25  # resumed: the clock began anew
+    assert speed(lengths, np.array([90, 100, 4, 8])) == 25  # resumed: the clock restarted
     assert speed(lengths[:1], np.array([10])) is None
 
 
@@ -95,7 +95,7 @@ def test_sb3s_plots_and_rl_zoos_layout_read_a_run(tmp_path):
     plt.close("all")
     # all_plots reads <log>/<algo>/<env>_<n>/evaluations.npz and these keys
     assert one.folder.parent.name == "wpt" and one.folder.name == "dmc-dot_0"
-    with np.load(one.folder / "evaluations.npz") as held:
-        assert held["timesteps"].tolist() == [25, 50, 75]
-        assert held["results"].shape == held["ep_lengths"].shape == (3, 2)
+    with np.load(one.folder / "evaluations.npz") as arrays:
+        assert arrays["timesteps"].tolist() == [25, 50, 75]
+        assert arrays["results"].shape == arrays["ep_lengths"].shape == (3, 2)
     assert json.loads((one.folder / "result.json").read_text())["steps"] == 75

@@ -39,11 +39,11 @@ STARTS = {
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes through /proc")
 @pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
 def test_a_worker_ends_with_a_killed_parent(tmp_path, start):
-    script, told = tmp_path / "parent.py", tmp_path / "pid"
+    script, pid_file = tmp_path / "parent.py", tmp_path / "pid"
     script.write_text(PARENT.replace("START", start))
-    parent = subprocess.Popen([sys.executable, str(script), str(told)])
+    parent = subprocess.Popen([sys.executable, str(script), str(pid_file)])
     try:
-        worker = int(until(lambda: told.exists() and told.read_text()))
+        worker = int(until(lambda: pid_file.exists() and pid_file.read_text()))
         assert alive(worker)
     finally:
         parent.send_signal(signal.SIGKILL)

@@ -155,8 +155,8 @@ def read_damaged(path: Path) -> dict[Place, str]:
     :raises ValueError: the list itself is damaged
     """
     try:
-        found = json.loads((path / "damaged.json").read_text(encoding="utf-8"))
-        return {(item["shard"], item["at"]): item["reason"] for item in found}
+        items = json.loads((path / "damaged.json").read_text(encoding="utf-8"))
+        return {(item["shard"], item["at"]): item["reason"] for item in items}
     except FileNotFoundError:
         return {}
     except (json.JSONDecodeError, TypeError, KeyError) as error:

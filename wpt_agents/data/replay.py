@@ -92,9 +92,9 @@ class ReplayBuffer:
 
         :raises ValueError: a file that is cut short, damaged, or not a replay buffer
         """
-        about, arrays = load_arrays(path, "ReplayBuffer")
+        head, arrays = load_arrays(path, "ReplayBuffer")
         replay = cls()
-        for i, labels in enumerate(about["episodes"]):
+        for i, labels in enumerate(head["episodes"]):
             streams = {n: arrays[f"{i}/{n}"] for n in ARRAYS if f"{i}/{n}" in arrays}
             replay.add(Trajectory(**(labels | streams)))
         return replay

@@ -64,11 +64,14 @@ class Retriever:
         features, at = np.zeros((len(dataset), 0), np.float32), 0
         with tqdm(total=len(dataset), desc="index", disable=not progress_bar) as bar:
             for image in dataset.first_observations():
-                found = np.asarray(embed(image), np.float32)
-                assert found.ndim == 2 and len(found) == len(image), (found.shape, image.shape)
+                feature = np.asarray(embed(image), np.float32)
+                assert feature.ndim == 2 and len(feature) == len(image), (
+                    feature.shape,
+                    image.shape,
+                )
                 if at == 0:
-                    features = np.empty((len(dataset), found.shape[1]), np.float32)
-                features[at : at + len(image)] = found
+                    features = np.empty((len(dataset), feature.shape[1]), np.float32)
+                features[at : at + len(image)] = feature
                 at += len(image)
                 bar.update(len(image))
         labels = dataset.action_dims, dataset.embodiments
@@ -128,12 +131,12 @@ class Retriever:
             return np.zeros(0, np.int64), np.zeros(0, np.float32)
         import faiss
 
-        query, found = np.ascontiguousarray(embed[None], np.float32), []
+        query, nearest = np.ascontiguousarray(embed[None], np.float32), []
         for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
             chunk = candidates[at : at + CHUNK]
             squared, near = faiss.knn(query, self.features[chunk], min(k, len(chunk)))
-            found.append((chunk[near[0]], squared[0]))
-        indices, squared = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            nearest.append((chunk[near[0]], squared[0]))
+        indices, squared = (np.concatenate(parts) for parts in zip(*nearest, strict=True))
         order = np.lexsort((indices, squared))[:k]  # equally near: in the dataset's order
         return indices[order], np.sqrt(squared[order])
 
@@ -167,22 +170,22 @@ class Retriever:
         return float(np.mean(same))
 
     def _candidates(self, embodiment: str | None, action_dim: int | None) -> np.ndarray:
-        wanted = np.ones(len(self), bool)
+        fits = np.ones(len(self), bool)
         if embodiment is not None:
-            wanted &= np.array([e is None or e == embodiment for e in self.embodiments], bool)
+            fits &= np.array([e is None or e == embodiment for e in self.embodiments], bool)
         if action_dim is not None:
-            wanted &= self.action_dims == action_dim
-        return np.flatnonzero(wanted)
+            fits &= self.action_dims == action_dim
+        return np.flatnonzero(fits)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one file atomically."""
-        about = {
+        head = {
             "encoder_id": self.encoder_id,
             "dataset_id": self.dataset_id,
             "embodiments": self.embodiments,
         }
         arrays = {"features": self.features, "action_dims": self.action_dims}
-        save_arrays(path, "Retriever", about, arrays)
+        save_arrays(path, "Retriever", head, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], encoder_id: str) -> "Retriever":
@@ -190,11 +193,11 @@ class Retriever:
 
         :raises ValueError: an index of another encoder, or a damaged file
         """
-        about, arrays = load_arrays(path, "Retriever")
-        if about["encoder_id"] != encoder_id:
+        head, arrays = load_arrays(path, "Retriever")
+        if head["encoder_id"] != encoder_id:
             raise ValueError(
-                f"{path} was built with the encoder {about['encoder_id']}, this one is "
+                f"{path} was built with the encoder {head['encoder_id']}, this one is "
                 f"{encoder_id}; delete the file and build the index again"
             )
-        labels = arrays["action_dims"], about["embodiments"]
-        return cls(arrays["features"], *labels, encoder_id, about.get("dataset_id", ""))
+        labels = arrays["action_dims"], head["embodiments"]
+        return cls(arrays["features"], *labels, encoder_id, head.get("dataset_id", ""))

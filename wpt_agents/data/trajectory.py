@@ -169,7 +169,7 @@ class Batch:
         rows, left = divmod(len(self.image), parts)
         assert left == 0, (len(self.image), parts)
         streams = {f.name: getattr(self, f.name).split(rows) for f in fields(self)}
-        rows_of = [{name: each[i] for name, each in streams.items()} for i in range(parts)]
+        rows_of = [{name: stream[i] for name, stream in streams.items()} for i in range(parts)]
         return [replace(self, **row) for row in rows_of]
 
     def pin(self) -> "Batch":

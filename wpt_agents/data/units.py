@@ -144,8 +144,8 @@ def in_units_of(trajectories: Iterable[Trajectory], box: spaces.Box) -> Iterator
             yield trajectory
             continue
         action = trajectory.action.copy()
-        own = action[:, : trajectory.action_dim]
-        own[:, dims] = rescaled(own[:, dims], box.low[dims], box.high[dims])
+        unpadded = action[:, : trajectory.action_dim]
+        unpadded[:, dims] = rescaled(unpadded[:, dims], box.low[dims], box.high[dims])
         yield replace(trajectory, action=action)
 
 

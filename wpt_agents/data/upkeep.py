@@ -52,13 +52,13 @@ def describe(folders: Sequence[Folder], entries: Sequence[Entry]) -> dict[str, A
 def find_damage(
     check: Callable[[int], str | None],
     count: int,
-    each: Callable[[Callable[[int], str | None], Iterable[int]], Iterable[str | None]],
+    apply: Callable[[Callable[[int], str | None], Iterable[int]], Iterable[str | None]],
     progress_bar: bool,
 ) -> list[Damage]:
     """Read trajectories 0 .. `count - 1` and list the damaged ones.
 
     :param check: reads a trajectory; what is wrong with it, or None
-    :param each: `map`, or a thread pool's
+    :param apply: `map`, or a thread pool's
     """
     from tqdm.auto import tqdm
 
@@ -66,7 +66,7 @@ def find_damage(
     with tqdm(total=count, desc="validate", disable=not progress_bar) as bar:
         for at in range(0, count, 256):  # in chunks, so that a thread pool does not queue them all
             chunk = range(at, min(at + 256, count))
-            for i, reason in zip(chunk, each(check, chunk), strict=True):
+            for i, reason in zip(chunk, apply(check, chunk), strict=True):
                 damaged += [Damage(i, reason)] if reason is not None else []
                 bar.update()
     return damaged

@@ -59,7 +59,7 @@ def make_batch(
     read: Callable[[Piece], tuple[Trajectory, int, int]],
     image_shape: tuple[int, ...],
     width: int,
-    each: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
+    apply: Callable[[Callable[[int], None], Iterable[int]], Iterable[Any]] = map,
     background: Callable[[int], np.ndarray] | None = None,
 ) -> Batch:
     """Copy the pieces of each row, one after the other, into a new Batch.
@@ -67,7 +67,7 @@ def make_batch(
     :param read: where a piece is: a trajectory, or a part of one, and the images to take of it
     :param image_shape: (H, W, 3)
     :param width: the agent's action width, `max_action_dim`
-    :param each: `map`, or a thread pool's if `read` takes time
+    :param apply: `map`, or a thread pool's if `read` takes time
     :param background: of a trajectory's number, (H, W, 3) uint8; with it, a `MarkedBatch` is made
     :raises ValueError: a trajectory with more actions than `width`
     """
@@ -88,7 +88,7 @@ def make_batch(
                 out["moving"][b, at : at + stop - start] = moving_pixels(seen, background(piece[0]))
             at += stop - start
 
-    for _ in each(fill, range(len(rows))):
+    for _ in apply(fill, range(len(rows))):
         pass
     kind = Batch if background is None else MarkedBatch
     return kind(**{name: torch.from_numpy(array) for name, array in out.items()})

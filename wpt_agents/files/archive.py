@@ -73,11 +73,11 @@ def sync_folder(folder: Path) -> None:
 def save_arrays(
     path: str | os.PathLike[str],
     kind: str,
-    about: Mapping[str, Any],
+    header: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
-    """Write `about` (JSON) and `arrays` atomically to one file of this `kind`."""
-    head = {"kind": kind, "version": VERSION, **about}
+    """Write `header` (JSON) and `arrays` atomically to one file of this `kind`."""
+    head = {"kind": kind, "version": VERSION, **header}
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         archive.writestr("about.json", json.dumps(head))
         for name, array in arrays.items():
@@ -96,9 +96,9 @@ def load_arrays(
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            about = json.loads(archive.read("about.json"))
-            if about["kind"] != kind or about["version"] > VERSION:
-                raise ValueError(f"it holds a {about['kind']} of version {about['version']}")
+            header = json.loads(archive.read("about.json"))
+            if header["kind"] != kind or header["version"] > VERSION:
+                raise ValueError(f"it holds a {header['kind']} of version {header['version']}")
             arrays = {}
             for name in archive.namelist():
                 if name.endswith(".npy"):
@@ -110,4 +110,4 @@ def load_arrays(
         raise ValueError(
             f"{path} is damaged or not a {kind} of version {VERSION} ({error}); make it again"
         ) from error
-    return about, arrays
+    return header, arrays

@@ -22,23 +22,23 @@ FAULTS += (AttributeError, RuntimeError, TypeError, ValueError)  # of zipfile an
 
 def write_model(
     path: str | os.PathLike[str] | BufferedIOBase,
-    about: Mapping[str, Any],
+    header: Mapping[str, Any],
     tensors: Mapping[str, Mapping[str, Tensor]],
 ) -> None:
     """Write JSON and named groups of tensors to `path`, or to an open binary file."""
     if isinstance(path, str | os.PathLike):
         with replacing(path) as temporary, open(temporary, "wb") as file:
-            _write(file, about, tensors)
+            _write(file, header, tensors)
     else:
-        _write(path, about, tensors)
+        _write(path, header, tensors)
 
 
 def _write(
-    file: BufferedIOBase, about: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+    file: BufferedIOBase, header: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
     # ZipInfo has no time of day in it: equal models are equal bytes
     with zipfile.ZipFile(file, "w") as archive:
-        head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **about}
+        head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **header}
         archive.writestr(zipfile.ZipInfo(ABOUT), json.dumps(head, indent=1))
         for name, group in tensors.items():
             with archive.open(zipfile.ZipInfo(name + TENSORS), "w", force_zip64=True) as member:
@@ -65,14 +65,14 @@ def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, di
     try:
         with zipfile.ZipFile(file) as archive:
             groups = _members(archive)
-            about = json.loads(archive.read(ABOUT))
-            if about["kind"] != KIND:
-                raise ValueError(f"it is a {about['kind']!r}")
-            if about["version"] > VERSION:
-                raise ValueError(f"it is of version {about['version']}: update wpt_agents")
-            if about.get("groups", groups) != groups:
-                raise ValueError(f"it should hold {about['groups']} and holds {groups}")
-            return about, {name: _tensors(archive, name) for name in groups}
+            header = json.loads(archive.read(ABOUT))
+            if header["kind"] != KIND:
+                raise ValueError(f"it is a {header['kind']!r}")
+            if header["version"] > VERSION:
+                raise ValueError(f"it is of version {header['version']}: update wpt_agents")
+            if header.get("groups", groups) != groups:
+                raise ValueError(f"it should hold {header['groups']} and holds {groups}")
+            return header, {name: _tensors(archive, name) for name in groups}
     except FAULTS as error:
         raise ValueError(
             f"{name} is no {KIND} of version {VERSION}, or is damaged ({error}); "

@@ -46,7 +46,7 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
     """
     if isinstance(env, VectorEnv):
         if isinstance(env.unwrapped, SyncVectorEnv):
-            env.unwrapped.envs = [_owning(each) for each in env.unwrapped.envs]
+            env.unwrapped.envs = [_owning(part) for part in env.unwrapped.envs]
         vec_env: VecEnv = GymnasiumVecEnv(env)
         vec_env = VecMonitor(vec_env) if monitor else vec_env
     elif isinstance(env, VecEnv):
@@ -54,7 +54,7 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
         _own_observations(vec_env)
     else:
         several = list(env) if isinstance(env, Sequence) and not isinstance(env, str) else [env]
-        vec_env = _side_by_side([_monitored(make(each), monitor) for each in several])
+        vec_env = _side_by_side([_monitored(make(part), monitor) for part in several])
     if isinstance(vec_env.observation_space, spaces.Dict):
         key = _image_key(vec_env.observation_space, image_key)
         vec_env = VecExtractDictObs(vec_env, key) if key is not None else vec_env
@@ -181,7 +181,7 @@ def _own_observations(env: VecEnv) -> None:
     """Let the environments of a DummyVecEnv copy, as it resets before it reports the last image."""
     inner = innermost(env)
     if isinstance(inner, DummyVecEnv):
-        inner.envs = [_owning(each) for each in inner.envs]
+        inner.envs = [_owning(part) for part in inner.envs]
 
 
 def innermost(env: VecEnv | None) -> VecEnv | None:

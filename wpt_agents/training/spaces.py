@@ -206,7 +206,7 @@ def action_remedy(space: spaces.Space[Any]) -> str:
         return f"wrap it so that each number is rounded, by {_act(formula, space.shape[0])}"
     parts = spaces.flatten_space(space) if space.is_np_flattenable else None
     members = _members(space)
-    if isinstance(parts, spaces.Box) and all(isinstance(each, spaces.Box) for each in members):
+    if isinstance(parts, spaces.Box) and all(isinstance(member, spaces.Box) for member in members):
         formula = "gymnasium.spaces.unflatten(space, action)"
         box = "gymnasium.spaces.flatten_space(env.action_space)"
         return f"flatten it by {_act(formula, box=box, more=', space=env.action_space')}"

@@ -62,9 +62,9 @@ def _up(height: float) -> float:
     return rewards.tolerance(height, bounds=(1.2, float("inf")), margin=1.2 / 2)
 
 
-def _speed(speed: float, wanted: float) -> float:
+def _speed(speed: float, target: float) -> float:
     return rewards.tolerance(
-        speed, bounds=(wanted, float("inf")), margin=wanted, value_at_margin=0, sigmoid="linear"
+        speed, bounds=(target, float("inf")), margin=target, value_at_margin=0, sigmoid="linear"
     )
 
 

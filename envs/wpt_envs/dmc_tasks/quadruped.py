@@ -52,9 +52,9 @@ class Roll(Stand):
         return super().get_reward(physics) * fast
 
 
-def _linear(value: float, wanted: float) -> float:
+def _linear(value: float, target: float) -> float:
     return rewards.tolerance(
-        value, bounds=(wanted, float("inf")), margin=wanted, value_at_margin=0.5, sigmoid="linear"
+        value, bounds=(target, float("inf")), margin=target, value_at_margin=0.5, sigmoid="linear"
     )
 
 

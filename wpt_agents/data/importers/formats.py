@@ -49,9 +49,9 @@ def open_episodes(
         raise refusal(os.fspath(source), NAMES)  # type: ignore[arg-type]  # a buffer has a format
     if form not in FORMATS:
         raise unknown_name("format", form, FORMATS)
-    own = inspect.signature(FORMATS[form].__init__).parameters
+    parameters = inspect.signature(FORMATS[form].__init__).parameters
     shared = inspect.signature(Episodes.__init__).parameters
-    valid = [name for name in [*list(own)[2:], *shared] if name not in ("self", "options")]
+    valid = [name for name in [*list(parameters)[2:], *shared] if name not in ("self", "options")]
     for name in options:
         if name not in valid:
             raise unknown_name(f"option for {form}", name, valid)

@@ -92,11 +92,11 @@ def find_actions(table: Table, action_keys: tuple[str, ...]) -> tuple[str, ...]:
             what = f"give action_key, one or several of: {', '.join(parts or table)}"
             raise ValueError(f"there is no array 'actions' or 'action'; {what} (--action-key)")
         return (name,)
-    found = [match(key, table) for key in action_keys]
-    if None in found:
-        missing = action_keys[found.index(None)]
+    names = [match(key, table) for key in action_keys]
+    if None in names:
+        missing = action_keys[names.index(None)]
         raise ValueError(f"there is no array {missing!r} of actions; there are: {', '.join(table)}")
-    return tuple(name for name in found if name is not None)
+    return tuple(name for name in names if name is not None)
 
 
 def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, ...]]:
@@ -136,14 +136,14 @@ def by_group(table: Table, action_keys: tuple[str, ...]) -> dict[str, Table]:
     """
     groups: dict[str, dict[str, Any]] = {}
     for name, array in table.items():
-        found = re.match(r"((?:[^/]*\D/)*[^/]*\d)/(.+)", name)
-        if found:
-            groups.setdefault(found[1], {})[found[2]] = array
-    wanted = [leaf(key) for key in action_keys] or list(ACTIONS)
+        numbered = re.match(r"((?:[^/]*\D/)*[^/]*\d)/(.+)", name)
+        if numbered:
+            groups.setdefault(numbered[1], {})[numbered[2]] = array
+    leaves = [leaf(key) for key in action_keys] or list(ACTIONS)
     holding = [
         group
         for group, arrays in groups.items()
-        if any(leaf(name) in wanted or name.split("/")[0] in wanted for name in arrays)
+        if any(leaf(name) in leaves or name.split("/")[0] in leaves for name in arrays)
     ]
     return {group: groups[group] for group in sorted(holding, key=natural)}
 

@@ -83,8 +83,8 @@ class NpzEpisodes(Episodes):
         if self._flat is not None and i >= len(self._files):
             return self._flat[i - len(self._files)]
         file = self._files[i]
-        wanted = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
-        arrays = arrays_of(file, wanted)
+        keys = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
+        arrays = arrays_of(file, keys)
         key = self._check(file, arrays)
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         if self.done_key is not None:

@@ -99,7 +99,7 @@ def _download(name: str) -> str:
 def _missing(path: Path) -> str:
     text = f"{path} does not exist"
     there = path.parent
-    names = [each.name for each in there.iterdir()] if there.is_dir() else []
+    names = [file.name for file in there.iterdir()] if there.is_dir() else []
     near = difflib.get_close_matches(path.name, names, n=1)
     if near:
         return f"{text}. Did you mean {there / near[0]}?"

@@ -49,7 +49,7 @@ def _is_single(data: memoryview) -> bool:
     try:
         for name, feature in _features(data):
             if name == "steps/is_first":
-                return [len(_values(*each)) for each in _fields(feature)] == [1]
+                return [len(_values(*field)) for field in _fields(feature)] == [1]
     except (KeyError, IndexError, TypeError, ValueError):
         pass
     return False
@@ -70,7 +70,7 @@ def read_steps(data: bytes, source: str) -> dict[str, Any]:
     try:
         for name, feature in _features(memoryview(data)):
             if name.startswith("steps/"):
-                steps |= {name[6:]: _values(*each) for each in _fields(feature)}
+                steps |= {name[6:]: _values(*field) for field in _fields(feature)}
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f"{source} is damaged or no tf.train.Example: {error}") from error
     if not steps:

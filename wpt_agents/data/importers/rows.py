@@ -32,27 +32,27 @@ class Cut:
     left_out: int
 
 
-def length(table: Table, found: Keys) -> int:
+def length(table: Table, columns: Keys) -> int:
     """The number of rows, that of the actions.
 
     :raises ValueError: images and actions are not equally many
     """
-    rows = count(table[found.actions[0]])
-    images = count(table[found.image])
+    rows = count(table[columns.actions[0]])
+    images = count(table[columns.image])
     if rows != images:
         raise ValueError(
-            f"{found.actions[0]!r} has {rows} rows and {found.image!r} {images}; in files of many "
-            "episodes they must be equally many"
+            f"{columns.actions[0]!r} has {rows} rows and {columns.image!r} {images}; "
+            "in files of many episodes they must be equally many"
         )
     return rows
 
 
-def cut(table: Table, found: Keys, done_key: str | None, shifted: bool | None) -> Cut:
+def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None) -> Cut:
     """Find where episodes end, by the user's key or the usual flags.
 
     :raises ValueError: there is no such flag, or the timing of `step_type` is not clear
     """
-    rows = length(table, found)
+    rows = length(table, columns)
     names = [done_key] if done_key is not None else [n for n in keys.ENDS if n in table]
     if done_key is not None and done_key not in table:
         raise ValueError(f"there is no array {done_key!r}; there are: {', '.join(table)}")
@@ -65,8 +65,8 @@ def cut(table: Table, found: Keys, done_key: str | None, shifted: bool | None) -
     ends = np.concatenate([_ends(np.ravel(table[name][:]), name, rows) for name in names])
     edges = np.unique(np.concatenate([[0], ends, [rows]]).astype(int)).tolist()
     if shifted is None:
-        shifted = "step_type" in names and _first_actions_are_empty(table, found, edges)
-    shortest = 1 if found.next_image and not shifted else 2
+        shifted = "step_type" in names and _first_actions_are_empty(table, columns, edges)
+    shortest = 1 if columns.next_image and not shifted else 2
     bounds = tuple((a, b) for a, b in pairwise(edges) if b - a >= shortest)
     return Cut(bounds, shifted, len(edges) - 1 - len(bounds))
 
@@ -85,9 +85,9 @@ def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
     return np.flatnonzero(flags) + 1
 
 
-def _first_actions_are_empty(table: Table, found: Keys, edges: list[int]) -> bool:
+def _first_actions_are_empty(table: Table, columns: Keys, edges: list[int]) -> bool:
     """Whether every episode's first action is a placeholder, as in dm_env's convention."""
-    action = read_actions(table, found, 0, edges[-1])[edges[:-1]]
+    action = read_actions(table, columns, 0, edges[-1])[edges[:-1]]
     if not np.nan_to_num(action).any():
         return True
     raise ValueError(
@@ -97,44 +97,44 @@ def _first_actions_are_empty(table: Table, found: Keys, edges: list[int]) -> boo
     )
 
 
-def read_actions(table: Table, found: Keys, start: int, stop: int) -> np.ndarray:
+def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarray:
     """The actions of some rows, several arrays side by side: (stop - start, A)."""
-    if len(found.actions) == 1:
-        return np.asarray(table[found.actions[0]][start:stop])
-    parts = [np.asarray(table[name][start:stop]) for name in found.actions]
+    if len(columns.actions) == 1:
+        return np.asarray(table[columns.actions[0]][start:stop])
+    parts = [np.asarray(table[name][start:stop]) for name in columns.actions]
     return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 
 def episode(
-    table: Table, found: Keys, start: int, stop: int, shifted: bool
+    table: Table, columns: Keys, start: int, stop: int, shifted: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
     """Images, actions, rewards and whether the end is a terminal state, of some rows, as ours."""
-    image = np.asarray(table[found.image][start:stop])
-    action = read_actions(table, found, start, stop)
-    reward = None if found.reward is None else np.asarray(table[found.reward][start:stop])
+    image = np.asarray(table[columns.image][start:stop])
+    action = read_actions(table, columns, start, stop)
+    reward = None if columns.reward is None else np.asarray(table[columns.reward][start:stop])
     if shifted:
         over = "discount" in table and not np.any(table["discount"][stop - 1 : stop])
         return image, action[1:], None if reward is None else reward[1:], over
-    if found.next_image is None:
+    if columns.next_image is None:
         return image, action[:-1], None if reward is None else reward[:-1], False
-    last = np.asarray(table[found.next_image][stop - 1 : stop])
+    last = np.asarray(table[columns.next_image][stop - 1 : stop])
     flag = first(keys.TERMINAL, table)
     over = flag is not None and bool(np.any(table[flag][stop - 1 : stop]))
     return np.concatenate([image, last]), action, reward, over
 
 
 def whole(
-    table: Table, found: Keys, where: str, shifted: bool | None
+    table: Table, columns: Keys, where: str, shifted: bool | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
     """The one episode of a table, with as many images as actions or one more."""
-    rows = count(table[found.actions[0]])
-    images = count(table[found.image])
+    rows = count(table[columns.actions[0]])
+    images = count(table[columns.image])
     if images == rows + 1:
-        reward: Any = None if found.reward is None else np.asarray(table[found.reward][:rows])
+        reward: Any = None if columns.reward is None else np.asarray(table[columns.reward][:rows])
         flag = first(keys.TERMINAL, table)
         over = flag is not None and bool(np.any(table[flag][rows - 1 : rows]))
-        image = np.asarray(table[found.image][:])
-        return image, read_actions(table, found, 0, rows), reward, over
+        image = np.asarray(table[columns.image][:])
+        return image, read_actions(table, columns, 0, rows), reward, over
     if images != rows:
         raise ValueError(f"{where} has {rows} actions for {images} images")
-    return episode(table, found, 0, rows, bool(shifted))
+    return episode(table, columns, 0, rows, bool(shifted))

@@ -91,17 +91,17 @@ class TableEpisodes(Episodes):
         groups = by_group(table, self.action_keys)
         if groups:
             return self._find_groups(file, groups, task)
-        found = find_keys(table, self.image_key, self.action_keys)
-        self._say_camera(found)
+        keys = find_keys(table, self.image_key, self.action_keys)
+        self._say_camera(keys)
         flags = self.done_key is not None or first(ENDS, table) is not None
-        one_more = count(table[found.image]) == count(table[found.actions[0]]) + 1
-        alone = several or found.image.startswith("observations/images/") or one_more
+        one_more = count(table[keys.image]) == count(table[keys.actions[0]]) + 1
+        alone = several or keys.image.startswith("observations/images/") or one_more
         if not flags and alone:
-            self._places.append(Place(file, "", None, found, self._shifted, task))
+            self._places.append(Place(file, "", None, keys, self._shifted, task))
             return 0
-        cut = rows.cut(table, found, self.done_key, self._shifted)
+        cut = rows.cut(table, keys, self.done_key, self._shifted)
         for bounds in cut.bounds:
-            self._places.append(Place(file, "", bounds, found, cut.shifted, task))
+            self._places.append(Place(file, "", bounds, keys, cut.shifted, task))
         return cut.left_out
 
     def _find_groups(self, file: Path, groups: dict[str, Table], task: str | None) -> int:
@@ -110,22 +110,22 @@ class TableEpisodes(Episodes):
         left_out = 0
         for group, table in groups.items():
             try:
-                found = find_keys(table, image_key, action_keys)
+                keys = find_keys(table, image_key, action_keys)
             except ValueError as error:
                 raise ValueError(f"{file} in {group}: {error}") from error
-            self._say_camera(found)
-            if count(table[found.image]) < 2 and found.next_image is None:
+            self._say_camera(keys)
+            if count(table[keys.image]) < 2 and keys.next_image is None:
                 left_out += 1
             else:
-                self._places.append(Place(file, group, None, found, self._shifted, task))
+                self._places.append(Place(file, group, None, keys, self._shifted, task))
         return left_out
 
-    def _say_camera(self, found: Keys) -> None:
-        if found.others and found.image not in self._chosen:
-            self._chosen.add(found.image)
+    def _say_camera(self, keys: Keys) -> None:
+        if keys.others and keys.image not in self._chosen:
+            self._chosen.add(keys.image)
             warnings.warn(
-                f"{self._root}: of several cameras {found.image!r} is taken; image_key "
-                f"(--image-key) chooses another: {', '.join(found.others)}",
+                f"{self._root}: of several cameras {keys.image!r} is taken; image_key "
+                f"(--image-key) chooses another: {', '.join(keys.others)}",
                 stacklevel=4,
             )
 

@@ -37,8 +37,8 @@ class TdMpc2Episodes(Episodes):
             raise ValueError(f"{file} holds no .pt file")
         self._opened: tuple[Path, Mapping[str, Any]] | None = None
         self._places: list[tuple[Path, int]] = []
-        for each in files:
-            self._places += [(each, row) for row in range(len(self._find(each)[0]))]
+        for part in files:
+            self._places += [(part, row) for row in range(len(self._find(part)[0]))]
 
     def _load(self, file: Path) -> Mapping[str, Any]:
         if self._opened is not None and self._opened[0] == file:

@@ -43,14 +43,14 @@ def updates(
     model = agent(size, precision, compiled)
     plain = agent(size, precision) if compiled else model
     data = synthetic_batch(batch, length).to(model.device)
-    about = {"size": size, "batch": batch, "length": length, "dtype": precision}
-    about |= {"compiled": True} if compiled else {}
+    columns = {"size": size, "batch": batch, "length": length, "dtype": precision}
+    columns |= {"compiled": True} if compiled else {}
     networks = model.policy.world_model, model.policy.actor, model.policy.critic
     for what, make, params in (
         ("world model", world_model_step, count(networks[0])),
         ("whole update", whole_step, count(*networks)),
     ):
-        case = make(model, data), about | {"what": what, "params": params}
+        case = make(model, data), columns | {"what": what, "params": params}
         yield from measured_in_turn([case], repetitions, counted=[make(plain, data)])
 
 
@@ -68,26 +68,28 @@ def measured_in_turn(
 
     With several threads of a CPU a step takes turns with itself on one, too: `times_one_thread`.
 
-    :param counted: the like of the steps for counting their work, which compiled code hides
+    :param counted: the same steps uncompiled, to count their work, which compiled code hides
     """
     steps, threads = [step for step, _ in cases], torch.get_num_threads()
     work = [gflop(step) for step in counted or steps]
-    held = [_peak_mb(step) for step in steps]
+    memory = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
     alone = [on_one_thread(step) for step in steps] if threads > 1 and device == "cpu" else []
     limits = {"ceiling_gflop_per_s": matmul(device=device)}
     limits |= {"onednn_gflop_per_s": onednn()} if device == "cpu" else {}
-    found = seconds_in_turn([*limits.values(), *steps, *alone], repetitions)
-    rates = {name: matmul_gflop() / cost(*took) for name, took in zip(limits, found, strict=False)}
-    times = found[len(limits) :]
+    timings = seconds_in_turn([*limits.values(), *steps, *alone], repetitions)
+    rates = {
+        name: matmul_gflop() / cost(*took) for name, took in zip(limits, timings, strict=False)
+    }
+    times = timings[len(limits) :]
     rows = []
-    for i, (_, about) in enumerate(cases):
-        (processor, wall), flops, peak = times[i], work[i], held[i]
+    for i, (_, columns) in enumerate(cases):
+        (processor, wall), flops, peak = times[i], work[i], memory[i]
         median = cost(processor, wall)
         faster = {"times_one_thread": times[len(cases) + i][1] / wall} if alone else {}
         rows.append(
             {
-                **about,
+                **columns,
                 "threads": threads,
                 "median_s": median,
                 "wall_s": wall,

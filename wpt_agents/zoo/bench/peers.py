@@ -63,15 +63,15 @@ def rows(
     size, batch, length = ("debug", 2, 8) if quick else ("small", 16, 64)
     data = synthetic_batch(batch, length)
     learners = ours(agent(size), data), PEERS[peer](SIZES[size], data)
-    about = {"size": size, "batch": batch, "length": length, "dtype": precision}
+    columns = {"size": size, "batch": batch, "length": length, "dtype": precision}
     for i, what in enumerate(("world model", "whole update")):
         cases = [
-            (one.steps[i], about | {"library": one.name, "what": what, "params": one.params[i]})
+            (one.steps[i], columns | {"library": one.name, "what": what, "params": one.params[i]})
             for one in learners
         ]
-        found = measured_in_turn(cases, 1 if quick else REPETITIONS)
-        for one, row in zip(learners, found, strict=True):
-            ratio = row["median_s"] / found[0]["median_s"]
+        measured = measured_in_turn(cases, 1 if quick else REPETITIONS)
+        for one, row in zip(learners, measured, strict=True):
+            ratio = row["median_s"] / measured[0]["median_s"]
             yield row | {"imagined": i * one.imagined, "ratio_to_ours": ratio}
 
 
@@ -142,14 +142,14 @@ def sheeprl_config(size: Size) -> Any:
 
 def sheeprl_batch(batch: Batch) -> dict[str, torch.Tensor]:
     """Its layout: time first, channels first, all float32."""
-    found = {
+    streams = {
         "rgb": batch.image.permute(0, 1, 4, 2, 3),
         "actions": batch.action.roll(-1, 1),  # it pairs an image with the action that follows
         "rewards": batch.reward[..., None],
         "terminated": batch.is_terminal[..., None],
         "is_first": batch.is_first[..., None],
     }
-    return {key: value.transpose(0, 1).float().contiguous() for key, value in found.items()}
+    return {key: value.transpose(0, 1).float().contiguous() for key, value in streams.items()}
 
 
 def torchrl(size: Size, batch: Batch) -> Learner:

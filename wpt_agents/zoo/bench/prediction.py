@@ -40,7 +40,7 @@ class Plan(NamedTuple):
     tasks: Sequence[str]
     behaviour: str
     episodes: int  # of each task, each with a seed of its own
-    held_out: int  # so many of them, the last ones, are not trained on
+    held_out: int  # how many of them are not trained on, counted from the last
     windows: int  # of each held-out trajectory
     updates: int
     further: int  # updates on the robot that was left out
@@ -132,21 +132,21 @@ def of(dataset: TrajectoryDataset, *robots: str) -> TrajectoryDataset:
 def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Predict]]:
     """By robot and name, what is compared; trains what is not trained yet."""
     robots = list(dict.fromkeys(str(robot) for robot in dataset.embodiments))
-    told, scratch = f"{plan.further} updates", f"scratch-{plan.further}"
+    budget, scratch = f"{plan.further} updates", f"scratch-{plan.further}"
     from_scratch = train(plan, scratch, of(dataset, LEFT_OUT), plan.further)
     generalist = train(plan, "generalist", dataset, plan.updates)
     untrained = WPT("WPTPolicy", seed=0, **plan.model)
-    found: dict[str, dict[str, Predict]] = {}
+    by_robot: dict[str, dict[str, Predict]] = {}
     for robot in robots:
-        own = of(dataset, robot)
+        trajectories = of(dataset, robot)
         start = scratch if robot == LEFT_OUT else None  # its first updates are the same
-        specialist = train(plan, f"specialist-{robot}", own, plan.updates, start)
-        found[robot] = {
+        specialist = train(plan, f"specialist-{robot}", trajectories, plan.updates, start)
+        by_robot[robot] = {
             "generalist": dream(generalist),
             "specialist": dream(specialist),
             "untrained": dream(untrained),
             "copy last frame": copy_last_frame,
-            "mean frame": MeanFrame(own),
+            "mean frame": MeanFrame(trajectories),
         }
     others = of(dataset, *(robot for robot in robots if robot != LEFT_OUT))
     zero_shot = train(plan, "left-out", others, plan.updates)
@@ -154,18 +154,18 @@ def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Pr
         plan, f"left-out-{plan.updates}-then", of(dataset, LEFT_OUT),
         plan.updates + plan.further, "left-out",
     )  # fmt: skip
-    found[LEFT_OUT] |= {
+    by_robot[LEFT_OUT] |= {
         "left out": dream(zero_shot),
-        f"left out, then {told}": dream(adapted),
-        f"from scratch, {told}": dream(from_scratch),
+        f"left out, then {budget}": dream(adapted),
+        f"from scratch, {budget}": dream(from_scratch),
     }
-    return found
+    return by_robot
 
 
 def train(
     plan: Plan, name: str, dataset: TrajectoryDataset, updates: int, start: str | None = None
 ) -> WPT:
-    """A world model after so many updates, of which those of the model `start` were the first.
+    """Train a world model up to `updates` updates, or continue from the model `start`.
 
     :raises ValueError: it has had more already
     """

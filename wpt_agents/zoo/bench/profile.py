@@ -17,8 +17,8 @@ def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iter
     model = agent(size, precision)
     step = whole_step(model, synthetic_batch(batch, length).to(model.device))
     step()
-    found = operators(step)
-    about = {"size": size, "batch": batch, "length": length, "dtype": precision}
-    yield {"what": "all operators", "count": sum(n for _, n, _ in found), "share": 1.0} | about
-    for name, count, share in found[:TOP]:
-        yield {"what": name, "count": count, "share": share} | about
+    counted = operators(step)
+    columns = {"size": size, "batch": batch, "length": length, "dtype": precision}
+    yield {"what": "all operators", "count": sum(n for _, n, _ in counted), "share": 1.0} | columns
+    for name, count, share in counted[:TOP]:
+        yield {"what": name, "count": count, "share": share} | columns

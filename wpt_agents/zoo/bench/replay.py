@@ -17,7 +17,7 @@ def rows(quick: bool = False) -> Iterator[dict]:
     for frames in (2_000,) if quick else (100_000, 10_000):
         before = memory_mib("VmRSS")
         replay = filled(frames)
-        held = memory_mib("VmRSS") - before
+        grown = memory_mib("VmRSS") - before
         sample = partial(replay.sample, 16, 64, ACTIONS, np.random.default_rng(0))
         processor, wall = seconds(sample, 3 if quick else 100, warmup=3)
         yield {
@@ -29,7 +29,7 @@ def rows(quick: bool = False) -> Iterator[dict]:
             "median_s": processor,
             "wall_s": wall,
             "image_mb": sum(t.image.nbytes for t in replay.trajectories) / 2**20,
-            "held_mb": held,
+            "held_mb": grown,
             "rss_mb": memory_mib("VmRSS"),
         }
         del replay, sample  # or the next case would begin with its memory

@@ -1,6 +1,6 @@
 """What retrieval finds in a mixed store, and what the index costs at the paper's size.
 
-Queries are the first images of fresh episodes, as in fine-tuning; the search is given neither the
+Queries are the first images of fresh episodes, as in fine-tuning; the search knows neither the
 robot's name nor its action width. Data and model are kept in `runs/bench/retrieval`.
 """
 
@@ -71,29 +71,29 @@ def pixels(image: np.ndarray) -> np.ndarray:
 
 def fresh_queries(tasks: list[str], number: int) -> Queries:
     """The first images of `number` episodes of each task, of seeds that collecting does not use."""
-    found = []
+    images = []
     for task in tasks:
         with closing(gym.make(task, **LOOK)) as env:
-            found += [env.reset(seed=10**6 + i)[0] for i in range(number)]
-    return Queries(np.stack(found), [task for task in tasks for _ in range(number)])
+            images += [env.reset(seed=10**6 + i)[0] for i in range(number)]
+    return Queries(np.stack(images), [task for task in tasks for _ in range(number)])
 
 
 def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> dict[str, Any]:
     """How many of the k nearest are of the query's own robot (DMControl) or task (Meta-World)."""
     retriever = Retriever.build(dataset, embed, "bench")
     robots, tasks = np.array(dataset.embodiments), np.array(dataset.tasks)
-    own: dict[str, list[float]] = {"dmc": [], "metaworld": []}
+    hits: dict[str, list[float]] = {"dmc": [], "metaworld": []}
     chance: dict[str, list[float]] = {"dmc": [], "metaworld": []}
     for task, feature in zip(asked.task, embed(asked.image), strict=True):
         row = TASKS[task]
         same = robots == row.embodiment if row.suite == "dmc" else tasks == task
-        own[row.suite].append(float(same[retriever.search(feature, k)[0]].mean()))
+        hits[row.suite].append(float(same[retriever.search(feature, k)[0]].mean()))
         chance[row.suite].append(float(same.mean()))
     return {
         "queries": len(asked.task),
-        "own robot, DMControl": _mean(own["dmc"]),
+        "own robot, DMControl": _mean(hits["dmc"]),
         "by chance": _mean(chance["dmc"]),
-        "own task, Meta-World": _mean(own["metaworld"]),
+        "own task, Meta-World": _mean(hits["metaworld"]),
         "by chance ": _mean(chance["metaworld"]),
     }
 

@@ -42,14 +42,14 @@ def _per_unit(row: dict[str, Any], grows: str, units: float) -> dict[str, Any]:
     return {"grows": grows, **row, "unit": UNITS[grows], "ms_per_unit": cost}
 
 
-def plot(found: list[dict[str, Any]], path: Path) -> None:
+def plot(measured: list[dict[str, Any]], path: Path) -> None:
     """A picture of `rows`: a panel an axis, a line for each kind of step; flat is proportional."""
     from matplotlib.figure import Figure
 
-    axes = [name for name in UNITS if any(row["grows"] == name for row in found)]
+    axes = [name for name in UNITS if any(row["grows"] == name for row in measured)]
     figure = Figure(figsize=(3.4 * len(axes), 3.2), layout="constrained")
     for name, panel in zip(axes, figure.subplots(1, len(axes), squeeze=False)[0], strict=True):
-        for label, points in _lines(found, name).items():
+        for label, points in _lines(measured, name).items():
             panel.plot(*zip(*points, strict=True), marker="o", label=label)
         panel.set_xlabel({"size": "GFLOP an update"}.get(name, name))
         panel.set_ylabel(f"ms per {UNITS[name]}")
@@ -60,11 +60,11 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _lines(found: list[dict[str, Any]], name: str) -> dict[str, list[tuple[float, float]]]:
+def _lines(measured: list[dict[str, Any]], name: str) -> dict[str, list[tuple[float, float]]]:
     """The points of each line of a panel, from left to right."""
     key = {"size": "gflop", "length": "length"}.get(name, "batch")
     lines: dict[str, list[tuple[float, float]]] = {}
-    for row in found:
+    for row in measured:
         case = SimpleNamespace(**row)
         if case.grows == name:
             label = case.what if name != "environments" else case.size

@@ -34,12 +34,12 @@ def seconds_in_turn(
     """`seconds` of several steps that take turns: what else the machine does befalls all alike."""
     times: list[list[tuple[float, float]]] = [[] for _ in steps]
     for _ in range(warmup + repetitions):
-        for step, found in zip(steps, times, strict=True):
+        for step, timings in zip(steps, times, strict=True):
             before = time.process_time(), time.perf_counter()
             step()
             _wait()
-            found.append((time.process_time() - before[0], time.perf_counter() - before[1]))
-    counted = [zip(*found[warmup:], strict=True) for found in times]
+            timings.append((time.process_time() - before[0], time.perf_counter() - before[1]))
+    counted = [zip(*timings[warmup:], strict=True) for timings in times]
     return [(statistics.median(processor), statistics.median(wall)) for processor, wall in counted]
 
 
@@ -91,7 +91,7 @@ def gflop(step: Callable[[], Any]) -> float:
 
 
 class _Everything(nullcontext):
-    """Counts for the whole and for no module by itself."""
+    """Count for the whole step only, not for each module."""
 
     parents = ("Global",)
 
@@ -108,9 +108,9 @@ def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:
 
 
 def peak_rss_mb() -> float:
-    """The most memory that this process has held since `forget_peak`; not a number on Windows.
+    """Return the peak memory of this process since `forget_peak`, or NaN on Windows.
 
-    Where the system cannot forget (all but Linux) it is the most since the process began.
+    Only Linux can reset the peak; elsewhere it is the peak since the process started.
     """
     try:
         import resource
@@ -121,7 +121,7 @@ def peak_rss_mb() -> float:
 
 
 def forget_peak() -> None:
-    """Starts `peak_rss_mb` anew, from what is in use now."""
+    """Reset `peak_rss_mb` to the memory in use now."""
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # where there is no glibc
         ctypes.CDLL(None).malloc_trim(0)  # what was freed and kept goes back to the system

@@ -9,7 +9,7 @@ from wpt_agents.model.ops import definitions
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
 from wpt_agents.zoo.bench.timing import gflop
 
-BATCH, LENGTH = 16, 64  # the work is told for these, counted on less and multiplied
+BATCH, LENGTH = 16, 64  # work is reported for this batch, counted on a smaller one and multiplied
 COUNTED = 1, 4
 NO_LAUNCH = {  # operators that compute nothing
     *("view", "_unsafe_view", "t", "transpose", "permute", "as_strided", "expand", "slice"),
@@ -31,8 +31,14 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
         )
         steps = world_model_step(model, data), whole_step(model, data)
         for what, step, number in zip(("world model", "whole update"), steps, params, strict=True):
-            about = {"what": what, "size": size, "params": number, "batch": BATCH, "length": LENGTH}
-            yield {**about, "tflop": scale * gflop(step), "operator_calls": calls[what]}
+            columns = {
+                "what": what,
+                "size": size,
+                "params": number,
+                "batch": BATCH,
+                "length": LENGTH,
+            }
+            yield {**columns, "tflop": scale * gflop(step), "operator_calls": calls[what]}
 
 
 def _calls(length: int) -> dict[str, int]:

@@ -41,7 +41,7 @@ def noise_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Ac
 
 
 def random_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Act, str]:
-    """Uniform actions, each step's drawn anew, and their name."""
+    """Uniform actions, drawn at every step, and their name."""
     return lambda obs, info, step: rng.uniform(-1, 1, width), "uniform random actions"
 
 

@@ -67,7 +67,7 @@ def collect(
     The data are a function of the arguments, `workers` and interruptions apart. Workers are fresh
     processes: call this from a script under `if __name__ == "__main__":`.
 
-    :param path: a folder; a finished one is returned as it is, half of one is continued
+    :param path: a folder; a finished one is returned unchanged, an unfinished one is continued
     :param tasks: ids for `gymnasium.make`
     :param behaviour: "noise", of random colour and strength; "random", uniform; "scripted",
         Meta-World's scripts with noise, elsewhere "noise"; "policy", a saved one with noise; "icm"
@@ -87,8 +87,8 @@ def collect(
     recipe = Recipe(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
-    told = {"tasks": list(tasks), "episodes": episodes, **recipe.label()}
-    dataset, total = _open(Path(path), told), len(tasks) * episodes
+    description = {"tasks": list(tasks), "episodes": episodes, **recipe.label()}
+    dataset, total = _open(Path(path), description), len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
             f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
@@ -179,8 +179,8 @@ def _collect_curious(
     def moved(stored: int) -> None:
         bar.update(finished + stored - bar.n)
 
-    for found in explore_each(trips, workers, moved):
-        dataset.extend(found.subset(range(dataset.appended % episodes, episodes)))
+    for gathered in explore_each(trips, workers, moved):
+        dataset.extend(gathered.subset(range(dataset.appended % episodes, episodes)))
         dataset.flush()
     moved(len(trips) * episodes)
     for folder in dataset.path.glob("exploring-*"):
@@ -219,15 +219,15 @@ def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
             raise ValueError(f"steps must be a whole number of at least {STAGES}, got {value!r}")
 
 
-def _open(path: Path, told: dict[str, Any]) -> TrajectoryDataset:
+def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     """The dataset to append to: a new one, or the one that the same call began."""
     label = path / "collect.json"
     dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
         with replacing(label) as temporary:
-            temporary.write_text(json.dumps(told, indent=1), encoding="utf-8")
-    found = _read_label(label) if label.exists() else {}
-    differ = [key for key in {**told, **found} if found.get(key) != told.get(key)]
+            temporary.write_text(json.dumps(description, indent=1), encoding="utf-8")
+    stored = _read_label(label) if label.exists() else {}
+    differ = [key for key in {**description, **stored} if stored.get(key) != description.get(key)]
     if differ:
         raise ValueError(
             f"{path} holds something else than this collection (different: {', '.join(differ)}); "

@@ -70,8 +70,8 @@ def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explo
     kind, file = EXPLORERS[trip.behaviour], trip.folder / "explorer.zip"
     if not file.exists():
         assert env.action_space.shape is not None
-        given = {**EXPLORE, "max_action_dim": env.action_space.shape[0], **trip.settings}
-        return kind("WPTPolicy", env, seed=trip.seed, **given)
+        keywords = {**EXPLORE, "max_action_dim": env.action_space.shape[0], **trip.settings}
+        return kind("WPTPolicy", env, seed=trip.seed, **keywords)
     model = kind.load(file, env=env)
     for trajectory in store.subset(range(model.episodes)):
         model.replay_buffer.add(trajectory)

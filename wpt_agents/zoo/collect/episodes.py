@@ -67,8 +67,8 @@ class Recipe:
     def label(self) -> dict[str, Any]:
         """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
         always, default = ("seed", "behaviour", "env"), vars(Recipe())
-        told = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
-        return json.loads(json.dumps(told))
+        changed = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
+        return json.loads(json.dumps(changed))
 
     def sigma(self, episode: int) -> float:
         """The noise of an episode."""
@@ -94,10 +94,10 @@ def play(job: Job) -> list[Trajectory]:
 
 def make_env(task: str, recipe: Recipe) -> gym.Env:
     """The task with actions in [-1, 1], telling its state to those who need it."""
-    told = recipe.behaviour == "scripted" and has_script(task)
-    told = told or (recipe.policy is not None and sees_states(recipe.policy))
-    told = told or recipe.stages is not None
-    env = gym.make(task, **{**recipe.env, **({"state_in_info": True} if told else {})})
+    needs_state = recipe.behaviour == "scripted" and has_script(task)
+    needs_state = needs_state or (recipe.policy is not None and sees_states(recipe.policy))
+    needs_state = needs_state or recipe.stages is not None
+    env = gym.make(task, **{**recipe.env, **({"state_in_info": True} if needs_state else {})})
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return env

@@ -64,17 +64,17 @@ def promises(
     generator = Generator(policy.device).manual_seed(0)
     batch = stack_windows([led_to(trajectory, 0, len(trajectory) + 1, width)]).to(policy.device)
     post, _, _ = model.observe(batch, generator)
-    value, found = policy.critic.value(post.feat)[0], []
+    value, rows = policy.critic.value(post.feat)[0], []
     for start in starts:
         state = Latent(*(x[:, start].repeat_interleave(SAMPLES, 0) for x in post))
         taken = batch.action[:, start + 1 : start + 1 + horizon].expand(SAMPLES, -1, -1)
         same, _ = model.rssm.imagine(state, partial(_taken, taken), horizon, generator)
-        own, _ = model.rssm.imagine(state, lambda s, _: _mode(policy, s), horizon, generator)
+        replanned, _ = model.rssm.imagine(state, lambda s, _: _mode(policy, s), horizon, generator)
         same_actions, own_actions = (
-            float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, own)
+            float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, replanned)
         )
         arriving, rest = float(batch.reward[0, start]), trajectory.reward[start:]
-        found.append(
+        rows.append(
             Promise(
                 start,
                 float(rest[:horizon].mean()),
@@ -84,7 +84,7 @@ def promises(
                 arriving + float(rest @ gamma ** np.arange(1, len(rest) + 1)),
             )
         )
-    return found
+    return rows
 
 
 def _taken(actions: Tensor, _: Latent, t: int) -> Tensor:
@@ -120,7 +120,7 @@ def diagnose(
     if not isinstance(model, WPT):
         raise ValueError(f"{trained.model} has no world model: diagnose takes runs of WPT")
     low, high = model.action_space.low, model.action_space.high
-    returns, errors, found = list[float](), list[float](), list[list[Promise]]()
+    returns, errors, promised = list[float](), list[float](), list[list[Promise]]()
     with closing(gym.make(trained.task, **trained.env)) as env:
         for episode in range(episodes):
             played = record(env, acting(model), seed + episode)
@@ -132,12 +132,12 @@ def diagnose(
             assert played.reward is not None
             returns.append(float(played.reward.sum()))
             errors.append(model.policy.heldout_errors(played, len(played) + 1)["reward"])
-            found.append(promises(model.policy, played, model.gamma, starts, horizon))
-    means = [Promise(*np.mean([astuple(p) for p in each], 0)) for each in zip(*found, strict=True)]
+            promised.append(promises(model.policy, played, model.gamma, starts, horizon))
+    means = [Promise(*np.mean([astuple(p) for p in row], 0)) for row in zip(*promised, strict=True)]
     return Diagnosis(returns, float(np.mean(errors)), means)
 
 
-def show(found: Diagnosis, horizon: int) -> None:
+def show(diagnosis: Diagnosis, horizon: int) -> None:
     """Prints a table of the promises, and what else is known."""
     title = f"Reward a step over {horizon} steps, and return, from a step on; means over episodes"
     table = Table(title=title)
@@ -145,8 +145,8 @@ def show(found: Diagnosis, horizon: int) -> None:
         table.add_column(name, justify="right")
     for name in ("critic's value", "discounted return"):
         table.add_column(name, justify="right")
-    for row in found.promises:
+    for row in diagnosis.promises:
         table.add_row(f"{row.start:.0f}", *(f"{x:.2f}" for x in astuple(row)[1:]))
     console.print(table)
-    console.print(f"Returns: {', '.join(f'{x:.0f}' for x in found.returns)}")
-    console.print(f"Reward head, on images it sees: {found.reward_error:.2f} off a step")
+    console.print(f"Returns: {', '.join(f'{x:.0f}' for x in diagnosis.returns)}")
+    console.print(f"Reward head, on images it sees: {diagnosis.reward_error:.2f} off a step")

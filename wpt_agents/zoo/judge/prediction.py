@@ -54,14 +54,15 @@ def judge(
             f"{CONTEXT} filtered and {HORIZON} predicted ones are asked for: take longer episodes"
         )
     for robot in dict.fromkeys(names[long].tolist()):
-        found = np.flatnonzero(long & (names == robot))
-        spread = np.linspace(0, len(found) - 1, min(episodes, len(found))).round().astype(int)
-        own = dataset.subset(found[spread])
-        tests[robot] = [windows(trajectory, 3, model.max_action_dim) for trajectory in own]
+        candidates = np.flatnonzero(long & (names == robot))
+        number = min(episodes, len(candidates))
+        spread = np.linspace(0, len(candidates) - 1, number).round().astype(int)
+        chosen = dataset.subset(candidates[spread])
+        tests[robot] = [windows(trajectory, 3, model.max_action_dim) for trajectory in chosen]
         ways[robot] = {
             "world model": dream(model),
             "copy last frame": copy_last_frame,
-            "mean frame": MeanFrame(own),
+            "mean frame": MeanFrame(chosen),
         }
     shown = [(robot, robot, ["world model"]) for robot in ways]
     return compare(ways, tests, folder, shown)
@@ -81,15 +82,15 @@ def compare(
     :param left_out: a robot whose other ways have a panel of their own
     """
     errors = {
-        robot: {name: errors_by_horizon(predict, tests[robot]) for name, predict in own.items()}
-        for robot, own in ways.items()
+        robot: {name: errors_by_horizon(predict, tests[robot]) for name, predict in by_name.items()}
+        for robot, by_name in ways.items()
     }
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         curves = [
-            Curve(robot, name, *with_interval(found))
-            for robot, own in errors.items()
-            for name, found in own.items()
+            Curve(robot, name, *with_interval(error))
+            for robot, by_name in errors.items()
+            for name, error in by_name.items()
         ]
         write_curves(folder / "prediction.csv", curves)
         draw_curves(folder / "prediction.png", curves, left_out)
@@ -98,9 +99,9 @@ def compare(
             for title, robot, names in shown
         ]
         draw_strips(folder / "strips.png", strips)
-    for robot, own in errors.items():
-        for name, found in own.items():
-            yield row(robot, name, found, own["copy last frame"])
+    for robot, by_name in errors.items():
+        for name, error in by_name.items():
+            yield row(robot, name, error, by_name["copy last frame"])
 
 
 def windows(trajectory: Trajectory, number: int, width: int) -> Batch:
@@ -152,26 +153,26 @@ def errors_by_horizon(predict: Predict, tests: Sequence[Batch]) -> np.ndarray:
 
     :param tests: a trajectory's windows in each
     """
-    each = [squared_error(batch.image.numpy(), predict(batch)) for batch in tests]
-    return np.stack([errors[:, CONTEXT - 1 :].mean(0) for errors in each])
+    by_window = [squared_error(batch.image.numpy(), predict(batch)) for batch in tests]
+    return np.stack([errors[:, CONTEXT - 1 :].mean(0) for errors in by_window])
 
 
-def with_interval(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def with_interval(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(trajectories, ...) -> the mean (...) and its 95 % interval, bootstrapped over the first."""
-    low, high = bootstrap(lambda strata: strata[0].mean(1), [found], draws=2000)
-    return found.mean(0), low, high
+    low, high = bootstrap(lambda strata: strata[0].mean(1), [errors], draws=2000)
+    return errors.mean(0), low, high
 
 
-def row(robot: str, name: str, found: np.ndarray, copied: np.ndarray) -> dict[str, Any]:
+def row(robot: str, name: str, errors: np.ndarray, copied: np.ndarray) -> dict[str, Any]:
     """Errors at a few horizons, then their mean over all and its difference from copying."""
-    means = found[:, 1:].mean(1)
+    means = errors[:, 1:].mean(1)
     mean, low, high = with_interval(means)
     less, least, most = with_interval(means - copied[:, 1:].mean(1))
     return {
         "robot": robot,
         "prediction": name,
-        "episodes": len(found),
-        **{f"+{h}": round(float(found[:, h].mean()), 1) for h in TOLD},
+        "episodes": len(errors),
+        **{f"+{h}": round(float(errors[:, h].mean()), 1) for h in TOLD},
         f"mean of 1 to {HORIZON}": round(float(mean), 1),
         "95 %": f"{low:.1f} to {high:.1f}",
         "minus copying": round(float(less), 1),
@@ -196,7 +197,7 @@ def strip(title: str, tests: Sequence[Batch], ways: Mapping[str, Predict]) -> St
     window = typical([part for batch in tests for part in one_by_one(batch)])
     at = [CONTEXT - 1 + h for h in SHOWN]
     images = {"true": window.image.numpy()} | {n: predict(window) for n, predict in ways.items()}
-    return Strip(title, {name: each[0, at] for name, each in images.items()}, SHOWN)
+    return Strip(title, {name: picture[0, at] for name, picture in images.items()}, SHOWN)
 
 
 def write_curves(path: Path, curves: Sequence[Curve]) -> None:

@@ -55,10 +55,10 @@ def spread(dataset: TrajectoryDataset, number: int) -> list[int]:
         places = np.linspace(0, len(groups) - 1, number).round().astype(int)
         return [list(groups.values())[i][0] for i in places]
     turns = sorted((turn, at) for at, ids in enumerate(groups.values()) for turn in range(len(ids)))
-    wanted = Counter(at for _, at in turns[:number])
+    quota = Counter(at for _, at in turns[:number])
     chosen = []
     for at, ids in enumerate(groups.values()):
-        chosen += [ids[int(i)] for i in np.linspace(0, len(ids) - 1, wanted[at]).round()]
+        chosen += [ids[int(i)] for i in np.linspace(0, len(ids) - 1, quota[at]).round()]
     return chosen
 
 
@@ -74,8 +74,8 @@ def contact_sheet(path: str | os.PathLike[str], dataset: TrajectoryDataset, rows
         for axis, step in zip(row, steps, strict=True):
             draw(axis, trajectory.image[step])
             axis.set_title(f"image {step}", fontsize=6, color=MUTED, pad=2)
-        about = [short(trajectory.task), trajectory.embodiment, trajectory.source]
-        text = "\n".join([f"#{i}", *(cut(part) for part in about if part)])
+        labels = [short(trajectory.task), trajectory.embodiment, trajectory.source]
+        text = "\n".join([f"#{i}", *(cut(part) for part in labels if part)])
         row[0].text(-0.12, 0.5, text, fontsize=7, color=INK, ha="right", va="center",
                     transform=row[0].transAxes)  # fmt: skip
     finish(figure, path, f"{len(chosen)} of {len(dataset):,} trajectories in {dataset.path}")

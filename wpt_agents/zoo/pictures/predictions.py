@@ -63,10 +63,12 @@ def draw_curves(
         shown = [c for c in curves if c.robot == robot and c.prediction in COMMON]
         _panel(axes, robot, shown)
     if left_out is not None:
-        own = [c for c in curves if c.robot == left_out]
-        own = [c for c in own if c.prediction not in COMMON or c.prediction == "copy last frame"]
+        shown = [c for c in curves if c.robot == left_out]
+        shown = [
+            c for c in shown if c.prediction not in COMMON or c.prediction == "copy last frame"
+        ]
         axes = panels[len(robots)]
-        _panel(axes, f"{left_out}, left out of pre-training", own)
+        _panel(axes, f"{left_out}, left out of pre-training", shown)
         axes.legend(frameon=False, fontsize=8)
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(
@@ -78,10 +80,10 @@ def draw_curves(
 
 def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
     for curve in curves:
-        given = style(curve.prediction)
+        look = style(curve.prediction)
         at = np.arange(len(curve.error))[1:]
-        axes.plot(at, curve.error[1:], label=curve.prediction, **given)
-        axes.fill_between(at, curve.low[1:], curve.high[1:], color=given["color"], alpha=0.13, lw=0)
+        axes.plot(at, curve.error[1:], label=curve.prediction, **look)
+        axes.fill_between(at, curve.low[1:], curve.high[1:], color=look["color"], alpha=0.13, lw=0)
     axes.set(title=title, xlabel="steps ahead", ylabel="squared error an image", yscale="log")
     axes.set_xticks([1, 10, 20, 30, 40])
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -122,11 +124,11 @@ def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:
     return picture
 
 
-def _grid(panels: int, each: tuple[float, float]) -> tuple[Any, list[Axes]]:
+def _grid(panels: int, panel_size: tuple[float, float]) -> tuple[Any, list[Axes]]:
     """A figure of three panels a row, or fewer if there are no more; what is left over is empty."""
     columns = min(3, panels)
     height = -(-panels // columns)
-    size = columns * each[0], height * each[1]
+    size = columns * panel_size[0], height * panel_size[1]
     figure, axes = plt.subplots(height, columns, figsize=size, layout="constrained", squeeze=False)
     for empty in axes.flat[panels:]:
         empty.set_visible(False)

@@ -23,7 +23,7 @@ class Query(NamedTuple):
     image: np.ndarray  # (64, 64, 3) uint8
     embodiment: str | None
     action_dim: int
-    own: int | None = None  # its number in the dataset, if it is from there
+    number: int | None = None  # its number in the dataset, if it is from there
 
 
 class Found(NamedTuple):
@@ -63,19 +63,19 @@ def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
     known = (robot, query.action_dim) if own_robot else (None, None)
     feature = model.policy.embed(query.image[None])[0]
     indices, distances = model.build_index().search(feature, number + 1, *known)
-    others = indices != (-1 if query.own is None else query.own)
+    others = indices != (-1 if query.number is None else query.number)
     return Found(query, indices[others][:number], distances[others][:number])
 
 
 def retrieval_sheet(
-    path: str | os.PathLike[str], dataset: TrajectoryDataset, found: Sequence[Found]
+    path: str | os.PathLike[str], dataset: TrajectoryDataset, results: Sequence[Found]
 ) -> None:
     """Draws each query beside the first images of what was found, its own robot's framed blue."""
-    columns = max(len(each.indices) for each in found) + 1
+    columns = max(len(result.indices) for result in results) + 1
     figure, axes = plt.subplots(
-        len(found), columns, figsize=(columns * 1.25, len(found) * 1.62 + 0.5), squeeze=False
+        len(results), columns, figsize=(columns * 1.25, len(results) * 1.62 + 0.5), squeeze=False
     )
-    for row, (query, indices, distances) in zip(axes, found, strict=True):
+    for row, (query, indices, distances) in zip(axes, results, strict=True):
         draw(row[0], query.image, INK, 2.5)
         row[0].set_title(query.name, fontsize=7, color=INK, fontweight="bold", pad=3)
         for axis in row[1 + len(indices) :]:
@@ -97,8 +97,8 @@ def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], see
     assert model.dataset is not None
     query = query_at(task, env, seed)
     rows = {"retrieved for\n": True, "nearest of all\n": False}
-    found = [
+    results = [
         search(model, query._replace(name=f"{name}{cut(task.name, 18)}"), COLUMNS, own_robot)
         for name, own_robot in rows.items()
     ]
-    retrieval_sheet(path, model.dataset, found)
+    retrieval_sheet(path, model.dataset, results)

@@ -67,14 +67,14 @@ def test_killed_at_any_write_a_save_leaves_one_model_whole_and_the_next_save_tid
 def test_what_a_living_process_is_writing_is_left_alone_and_a_dead_ones_is_removed(tmp_path):
     gone = started(os.getpid)
     gone.join()
-    with archive.replacing(tmp_path / "file") as own:
-        own.write_text("ours")
-        here = str(own).removesuffix(str(os.getpid()))
+    with archive.replacing(tmp_path / "file") as temporary:
+        temporary.write_text("ours")
+        here = str(temporary).removesuffix(str(os.getpid()))
     living, dead, foreign = (Path(here + name) for name in (str(os.getppid()), str(gone.pid), "x"))
     for path in (living, dead, foreign):
         path.write_text("somebody else's")
-    with archive.replacing(tmp_path / "file") as own:
-        own.write_text("new")
+    with archive.replacing(tmp_path / "file") as temporary:
+        temporary.write_text("new")
     assert {*tmp_path.iterdir()} == {tmp_path / "file", living, foreign}
 
 
@@ -171,8 +171,8 @@ def test_a_model_loads_in_a_process_that_has_no_dataset(tmp_path):
     shutil.rmtree(tmp_path / "data")
     words = [sys.executable, "-c", LOAD, str(tmp_path / "model.zip")]
     root = Path(__file__).parents[2]
-    told = subprocess.run(words, capture_output=True, text=True, cwd=root)
-    assert told.stdout.strip() == str(expected), told.stderr
+    process = subprocess.run(words, capture_output=True, text=True, cwd=root)
+    assert process.stdout.strip() == str(expected), process.stderr
 
 
 def test_a_model_goes_on_in_each_phase_on_other_widths_and_more_environments(tmp_path):
@@ -242,11 +242,11 @@ print(sha.hexdigest())
 def test_the_order_of_pythons_hashes_changes_no_weight():
     root = Path(__file__).parents[2]
     helpers = root / "tests" / "helpers"
-    found = set()
+    printed = set()
     for seed in random.Random(0).sample(range(1000), 2):
         environment = os.environ | {"PYTHONHASHSEED": str(seed), "OMP_NUM_THREADS": "1"}
         words = [sys.executable, "-c", LEARN, str(helpers), str(root)]
-        told = subprocess.run(words, capture_output=True, text=True, cwd=root, env=environment)
-        assert told.returncode == 0, told.stderr
-        found.add(told.stdout)
-    assert len(found) == 1
+        process = subprocess.run(words, capture_output=True, text=True, cwd=root, env=environment)
+        assert process.returncode == 0, process.stderr
+        printed.add(process.stdout)
+    assert len(printed) == 1

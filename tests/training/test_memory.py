@@ -43,9 +43,9 @@ def test_pretraining_on_a_large_dataset_and_loading_again_and_again_take_no_more
             image = rng.integers(0, 256, (501, 64, 64, 3), np.uint8)
             dataset.append(Trajectory(image, rng.uniform(-1, 1, (500, 2)).astype(np.float32)))
     words = [sys.executable, "-c", PROGRAM, str(tmp_path / "data"), str(tmp_path / "model.zip")]
-    printed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
-    assert printed.returncode == 0, printed.stderr
-    seen, loads = json.loads(printed.stdout.splitlines()[-1])
+    process = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    seen, loads = json.loads(process.stdout.splitlines()[-1])
     print(seen, loads)
     assert max(seen[2:]) < 1.05 * seen[1], seen  # of which the dataset would be a multiple
     assert max(loads[2:]) < 1.02 * loads[1], loads

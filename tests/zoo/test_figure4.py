@@ -46,9 +46,9 @@ def sequences(tmp_path):
 
 def test_a_sequence_is_read_back_as_it_was_written(tmp_path):
     result = make_sequence(tmp_path, "wpt", [[800.0], [100.0, 600.0]])
-    [(folder, found)] = find_sequences(tmp_path)
-    assert found == result and folder.name == "ant_0"
-    assert found.command.endswith("--method wpt --preset tiny --frames 400 --seeds 0-0")
+    [(folder, reread)] = find_sequences(tmp_path)
+    assert reread == result and folder.name == "ant_0"
+    assert reread.command.endswith("--method wpt --preset tiny --frames 400 --seeds 0-0")
 
 
 def test_the_matrix_is_the_mean_over_seeds_and_packnet_is_a_share_of_wpt(sequences):

@@ -52,17 +52,17 @@ def evaluate_until_killed(folder, number):
 
 @pytest.mark.slow
 def test_killed_at_any_write_the_evaluations_are_whole(tmp_path):
-    found = set()
+    states = set()
     for number in count():
         folder = tmp_path / "run"
         folder.mkdir()
         over = not killed(evaluate_until_killed, folder, number)
         there = (folder / "evaluations.npz").exists()
-        found.add(tuple(evaluations(folder)) if there else None)
+        states.add(tuple(evaluations(folder)) if there else None)
         shutil.rmtree(folder)
         if over:
             break
-    assert found == {None, (7,), (7, 14)}
+    assert states == {None, (7,), (7, 14)}
 
 
 def write_results_until_killed(folder, number):
@@ -76,11 +76,11 @@ def result(value):
 
 
 def test_killed_at_any_write_a_result_is_that_before_or_after(tmp_path):
-    found = set()
+    states = set()
     for number in count():
         write_result(tmp_path, result(1.0))
         over = not killed(write_results_until_killed, tmp_path, number)
-        found.add(read_result(tmp_path).scores["last"].returns)
+        states.add(read_result(tmp_path).scores["last"].returns)
         if over:
             break
-    assert found == {(1.0, 1.0), (2.0, 2.0)} and number > 2
+    assert states == {(1.0, 1.0), (2.0, 2.0)} and number > 2

@@ -58,14 +58,14 @@ except SystemExit:
 """
 
 
-@pytest.mark.parametrize(("given", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
-def test_the_zoo_lets_threads_wait_by_sleeping_unless_told_otherwise(given, expected):
+@pytest.mark.parametrize(("policy", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_the_zoo_lets_threads_wait_by_sleeping_unless_told_otherwise(policy, expected):
     environment = {name: v for name, v in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    if given:
-        environment["OMP_WAIT_POLICY"] = given
+    if policy:
+        environment["OMP_WAIT_POLICY"] = policy
     words = [sys.executable, "-c", POLICY]
-    told = subprocess.run(words, env=environment, cwd=ROOT, capture_output=True, text=True)
-    assert told.stdout.splitlines()[-1] == f"POLICY {expected} False", told.stderr
+    process = subprocess.run(words, env=environment, cwd=ROOT, capture_output=True, text=True)
+    assert process.stdout.splitlines()[-1] == f"POLICY {expected} False", process.stderr
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_the_table_compares_threads_and_policies_with_and_without_a_neighbour():
     assert ran.exit_code == 0, ran.output
     rows = [json.loads(line) for line in ran.stdout.splitlines()]
     cases = [(row["threads"] > 1, row["wait policy"], row["busy neighbours"] > 0) for row in rows]
-    each = [(False, "default"), (True, "default"), (True, "passive")]
-    assert cases == [(*case, busy) for busy in (False, True) for case in each]
+    variants = [(False, "default"), (True, "default"), (True, "passive")]
+    assert cases == [(*case, busy) for busy in (False, True) for case in variants]
     assert all(row["updates_per_s"] > 0 for row in rows)
     assert torch.get_num_threads() == 1  # this process is left alone

@@ -59,8 +59,8 @@ def test_a_long_trajectory_is_glanced_at():
 def test_a_batch_marks_each_piece_by_its_own_background(tmp_path):
     scenes = [scene(40, 6), scene(200, 3)]  # a row of 9 images is chained of both
     replay = ReplayBuffer()
-    for scene in scenes:
-        replay.add(scene)
+    for trajectory in scenes:
+        replay.add(trajectory)
     dataset = stored(tmp_path, *scenes)
     drawn = (
         mix(replay, None, 0.0, 8, 9, 2, rng(), mark=True),

@@ -150,7 +150,7 @@ class PixelAgent(SavedAgent):
             action = self.policy.to_env(rollout.act(image))
             meanwhile = self.update_models if self.hyperparameters.train_freq == "step" else None
             new_obs, rewards, dones, infos = step_all(self.env, action, meanwhile)
-            check_rewards(rewards, self.num_timesteps)
+            check_rewards(rewards, self.num_timesteps)  # before anything of this step is recorded
             self.num_timesteps += self.n_envs
             if self.warmup_pays or self.num_timesteps > self.hyperparameters.learning_starts:
                 self.credit += self.n_envs

@@ -115,7 +115,7 @@ class Plan2ExploreLearner(CuriousLearner):
             prediction = ensemble(post.feat[:, :-1], batch.action[:, 1:])
             loss = ensemble_loss(prediction, embed, within)
         self.descend(self.curiosity_optimizer, loss, "curiosity")
-        surprise = disagreement(prediction.detach())
+        surprise = disagreement(prediction.detach())  # the reward must not train the ensemble
         ensemble.scale.see(surprise[within])
         paid = ensemble.scale(surprise) * within
         self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
@@ -160,7 +160,11 @@ class Explorer(WPT):
         """
         assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
         _, callback = self._setup_learn(
-            sys.maxsize // 2, None, reset_num_timesteps=False, tb_log_name="explore"
+            # no end: `episodes` decides; half, because SB3 adds the steps so far
+            sys.maxsize // 2,
+            None,
+            reset_num_timesteps=False,
+            tb_log_name="explore",
         )
         while self.episodes < episodes:
             self.env.seed(self.streams.integer(Purpose.RESET, self.episodes))

@@ -85,6 +85,7 @@ def noisy_action(
     """
     noise = std * torch.randn(mean.shape, device=mean.device, generator=generator)
     action = mean + (noise if clip is None else noise.clamp(-clip, clip))
+    # Straight-through: the gradient passes the clamp, as in the published code.
     return action - action.detach() + action.detach().clamp(-EDGE, EDGE)
 
 

@@ -173,11 +173,12 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
         :param stream: another number for each batch of the same update
         """
+        # Not from `Streams`: RLPD draws two batches in an update, each with a number of its own.
         rng = np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
         settings = self.hyperparameters
         shape = size, n_steps, settings.gamma, self.policy.action_dim
         seen = self.seen(replay)
-        pad = settings.pad if seen is None else 0
+        pad = settings.pad if seen is None else 0  # features cannot be shifted
         batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen)
         return batch.to(self.device)
 
@@ -206,6 +207,7 @@ def descend(optimizer: Optimizer, loss: Tensor, name: str) -> None:
 
     :raises FloatingPointError: the loss is not finite; the weights are as before
     """
+    # DrQ-v2 clips no gradients, so there is no norm to look at, as `training.descent` does.
     if not loss.isfinite():
         raise FloatingPointError(
             f"The {name} loss is {loss.item()}; this step was not taken and the weights are as "

@@ -92,6 +92,7 @@ class PackNetPolicy(DrQv2Policy):
             weight[free] = fresh[name][free]
         _, features, hidden = self.widths
         shape = self.encoder.embed_dim, features, hidden, self.action_dim
+        # A critic belongs to one task's rewards; the paper re-initialises it, too.
         self.critic = Critic(*shape).apply(orthogonal).to(self.device)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
 
@@ -197,6 +198,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
 
     def restore(self, contents: Mapping[str, Any], *args: Any) -> None:
         """Take over a model file; in a later task biases and layer norms are frozen."""
+        # before the weights are read: the optimisers must hold the parameters that the file's have
         if contents["counters"]["task"]:
             self.policy.freeze_rest()
             self.learner = self.make_learner()  # its optimisers leave out what is frozen

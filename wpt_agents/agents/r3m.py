@@ -52,6 +52,7 @@ class FrameFeatures(nn.Module):
         super().__init__()
         if backbone == "conv":
             body = FrameEncoder((channels,) * 4, (2, 1, 1, 1), frames=1, centre=0.5)
+            # 512, as wide as a ResNet18's output
             self.body: nn.Module = nn.Sequential(body, nn.Linear(body.embed_dim, 512))
             self.width = 512
         else:

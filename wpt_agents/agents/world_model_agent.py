@@ -125,6 +125,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             return length
         assert self.env is not None
         spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+        # 500 calls of `env.step` are an episode of DMControl at action repeat 2.
         return getattr(spec, "max_episode_steps", None) or 500
 
     def on_episode(self, trajectory: Trajectory) -> None:

@@ -32,6 +32,7 @@ def _to_jpeg(images: np.ndarray, vector: bytes) -> bytes:
 
     stream = BytesIO()
     tall = Image.fromarray(np.ascontiguousarray(images).reshape(-1, images.shape[2], 3))
+    # subsampling=0 keeps the full resolution of colours, of which 64 pixels have little to lose.
     tall.save(stream, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     return stream.getvalue() + vector
 

@@ -158,7 +158,7 @@ def from_episodes(
         initial=done,
         desc="convert",
         unit=" episodes",
-        mininterval=0.2 if sys.stderr.isatty() else 10,
+        mininterval=0.2 if sys.stderr.isatty() else 10,  # a log file needs fewer lines
         disable=not progress_bar or done == len(episodes),
     )
     ranges = Ranges()
@@ -197,6 +197,7 @@ def cache_folder(source: Source) -> Path:
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     digest = hashlib.sha256(os.fsencode(path))
     for file in files:
+        # Size and time instead of the content, which may be many gigabytes.
         stat = file.stat()
         digest.update(f"{file.name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

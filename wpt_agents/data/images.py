@@ -25,6 +25,7 @@ def resized(images: np.ndarray, size: int) -> np.ndarray:
     for at in range(0, len(images), CHUNK):
         pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + CHUNK])).float()
         count = len(pixels)
+        # The average over an area separates into one product for each axis.
         pixels = rows @ pixels.reshape(count, height, width * channels)
         pixels = columns @ pixels.reshape(count, size, width, channels)
         parts.append(pixels.round().clamp(0, 255).byte().numpy())

@@ -130,6 +130,7 @@ def read_index(path: Path) -> tuple[list[Entry], int]:
     if not (path / "index.jsonl").exists():
         raise ValueError(f"{path} has lost its index.jsonl; restore the file")
     data = (path / "index.jsonl").read_bytes()
+    # what follows is half a line of a writer at work, or of a killed one
     end = data.rfind(b"\n") + 1
     lines = data[:end].split(b"\n")[:-1]
     for i, line in enumerate(lines):

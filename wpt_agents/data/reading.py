@@ -121,6 +121,7 @@ class StoredTrajectories:
         """A hash of the trajectories and their order; a retrieval index keeps its dataset's."""
         digest = hashlib.sha256()
         for e in self._entries:
+            # datasets of older versions have none, and keep their fingerprint
             checksum = "" if e.checksum is None else f" {e.checksum}"
             digest.update(f"{e.shard} {e.at} {e.length} {e.blocks}{checksum}\n".encode())
         return digest.hexdigest()

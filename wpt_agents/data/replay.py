@@ -133,6 +133,7 @@ def mix(
         drawn = retrieved.draw(others, length, rng)
         rows += [[(behind + i, start, stop) for i, start, stop in row] for row in drawn]
     batch = _batch_of(trajectories, rows, action_width, mark)
+    # The retrieved rows are last, as in the authors' batches of 12 + 4.
     batch.reward[batch_size - others :] = 0
     batch.reward_known[batch_size - others :] = False
     return batch

@@ -89,6 +89,7 @@ class Retriever:
 
         The index of a subset is built each time, since the folder holds that of the whole dataset.
         """
+        # Named by its encoder, so that models do not overwrite each other's index.
         path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
         whole = not dataset.is_subset
         if whole and path.exists():
@@ -134,6 +135,7 @@ class Retriever:
         query, nearest = np.ascontiguousarray(embed[None], np.float32), []
         for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
             chunk = candidates[at : at + CHUNK]
+            # exact search, as the authors' IndexFlatL2
             squared, near = faiss.knn(query, self.features[chunk], min(k, len(chunk)))
             nearest.append((chunk[near[0]], squared[0]))
         indices, squared = (np.concatenate(parts) for parts in zip(*nearest, strict=True))

@@ -39,6 +39,7 @@ def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[mem
     name = f"shard-{entry.shard:05d}.bin"
     with FileIO(path / name) as file:
         file.seek(entry.at + sum(sizes[:first]))
+        # One read for all blocks, which are adjacent.
         data = memoryview(file.read(sum(sizes[first : last + 1])))
     at, checksum = 0, 0
     for block in range(first, last + 1):
@@ -46,6 +47,7 @@ def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[mem
         at += sizes[block]
         if len(stored) < sizes[block] or zlib.crc32(stored[:-4]) != int.from_bytes(stored[-4:]):
             raise OSError(f"block {block} of {name} is cut short or does not match its checksum")
+        # of the blocks' checksums: cheap, and tells trajectories apart
         checksum = zlib.crc32(stored[-4:], checksum)
         yield stored
     all_read = first == 0 and last + 1 == len(sizes)
@@ -106,11 +108,13 @@ class Writer:
 
     def __init__(self, path: Path, meta: Meta) -> None:
         self._path, self._meta = path, meta
+        # Unbuffered, so that a line is in the file when `_write` returns, and not later.
         self._index = FileIO(path / "index.jsonl", "rb+")
         try:
             lock(self._index.fileno())
             entries, end = read_index(path)
             self.entries = undamaged(path, entries)
+            # Half a line, or blocks without a line, are what a killed writer left.
             self._index.truncate(end)
             self._index.seek(end)
             self._number, self._end = 0, 0
@@ -156,6 +160,7 @@ class Writer:
             for block in blocks:
                 sizes.append(_write(self._shard.fileno(), block))
                 checksum = zlib.crc32(block[-4:], checksum)
+            # A line promises that its blocks are on the disk, so they go first.
             os.fsync(self._shard.fileno())
             entry = replace(
                 labels,

@@ -221,6 +221,7 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
         begin = max(start, 1)  # no reward led to image 0
         reward[begin - start :] = trajectory.reward[begin - 1 : stop - 1]
         known[begin - start :] = True
+    # a time limit is no terminal state: its last image is like any other
     is_terminal[-1] = trajectory.terminated and stop == length + 1
     return {
         "image": trajectory.image[start:stop],

@@ -123,6 +123,7 @@ def draw_transitions(
     chosen = np.searchsorted(starts, drawn, side="right")
     begin = drawn - np.concatenate([[0], starts])[chosen]
     shown = [t.image for t in trajectories] if seen is None else seen
+    # both ends of a transition in one array, which is filled row by row
     image = np.empty((2, size, frames, *shown[0].shape[1:]), shown[0].dtype)
     action = np.zeros((size, action_dim), np.float32)
     outcome = np.zeros((2, size), np.float32)
@@ -136,6 +137,7 @@ def draw_transitions(
         reward = np.zeros(end - s) if trajectory.reward is None else trajectory.reward[s:end]
         terminated = trajectory.terminated and end == len(trajectory)
         outcome[:, row] = n_step_return(reward, gamma, terminated)
+    # Shifted independently, as in DrQ-v2.
     now, then = (random_shift(side, pad, rng) if pad else side for side in image)
     tensors = [torch.from_numpy(array) for array in (now, action, *outcome, then)]
     return Transitions(*tensors)

@@ -107,6 +107,7 @@ def compare_units(dataset: Any, box: spaces.Box, embodiment: str | None = None) 
     ):
         if bounds is None or dim != width or (embodiment and name not in (None, embodiment)):
             continue
+        # low=-1 and high=1 is how users say that their actions need no conversion
         in_no_units = np.array_equal(bounds, [[-1] * width, [1] * width])
         if not in_no_units and not np.allclose(bounds, [box.low, box.high], rtol=1e-3, atol=1e-3):
             key = tuple(tuple(float(x) for x in row) for row in bounds)

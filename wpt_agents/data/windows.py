@@ -34,9 +34,11 @@ class Windows:
         """Draw the pieces of `batch_size` sequences; several each if trajectories are short."""
         known, ends = self._ends
         if known != length:
+            # a short trajectory counts as one window
             ends = np.cumsum(np.maximum(self._images - length + 1, 1))
             self._ends = length, ends
         draws = rng.integers(ends[-1], size=batch_size)
+        # One draw over all windows, so that long trajectories are seen more often than short ones.
         chosen = np.searchsorted(ends, draws, side="right")
         starts = draws - np.concatenate([[0], ends])[chosen]
         return [

@@ -97,6 +97,7 @@ def networks_are_known(policy: WPTPolicy, *_: Any, **__: Any) -> bool:
     that were made in `torch.inference_mode` have no versions.
     """
     encoder, rssm, actor = networks_of(policy)
+    # `type` and not `isinstance`: a subclass may compute something else
     known = type(encoder) is Encoder and type(rssm) is RSSM and type(actor) is Actor
     return known and on_cpu(rssm.post_in.bias) and not rssm.post_in.bias.is_inference()
 

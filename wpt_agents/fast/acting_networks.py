@@ -142,6 +142,7 @@ class FastFilter:
         self.norm = gru.norm
         self.gates = gru.gates.weight
         gates_bias = gru.gates.bias.detach().clone()
+        # The 1 that `BlockGRU` subtracts becomes part of the bias.
         split_gates(gates_bias[None], gru.blocks, gru.layout)[2].sub_(1)  # of the update gate
         self.gates_bias = gates_bias.view(gru.blocks, 1, -1)
         from_deter = rssm.post_in.weight[:, : size.deter]

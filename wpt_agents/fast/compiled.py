@@ -31,6 +31,7 @@ def compile_loops(policy: WPTPolicy, backend: str | Callable[..., Any] = "induct
     :param backend: of `torch.compile`
     """
     # the functions must not refer to their keys, or these would never be forgotten
+    # fullgraph: a break in the graph would bring back the launches that compiling saves
     _steps[policy.world_model.rssm] = torch.compile(
         _step, backend=backend, dynamic=False, fullgraph=True
     )

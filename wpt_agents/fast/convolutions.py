@@ -104,6 +104,7 @@ def phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     :return: (N, H + 2, W + 2, 4 outputs) of (N, inputs, H, W), (inputs, outputs, K, K), (outputs,)
     """
     inputs, outputs, kernel, _ = weight.shape
+    # A kernel of 5 becomes one of 6, whose parities all have 3 x 3 entries.
     weight = F.pad(weight, (0, 6 - kernel, 0, 6 - kernel))
     weight = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
     weight = weight.reshape(4 * outputs, inputs, 3, 3)

@@ -151,7 +151,7 @@ class FilterScan(torch.autograd.Function):
         steps: Steps = ctx.steps
         for layer in steps.layers:
             layer.slopes.clear()  # of an earlier way back through the same graph
-        share = 1 - steps.unimix
+        share = 1 - steps.unimix  # the slope of the mixed probabilities at the unmixed ones
         # z has the gradient of the probabilities (straight-through), and their logarithm is the
         # third output
         to_probs = (to_stochs + to_logits / ctx.mixed) * share

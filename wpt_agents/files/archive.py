@@ -81,6 +81,7 @@ def save_arrays(
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         archive.writestr("about.json", json.dumps(head))
         for name, array in arrays.items():
+            # zip64, because the size is not known before the array is written
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(  # type: ignore[no-untyped-call]
                     member, array, allow_pickle=False

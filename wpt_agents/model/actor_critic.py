@@ -57,8 +57,9 @@ def draw_starts(
         return index[:, first:].flatten()
     order = torch.rand(batch_size, length, device=device, generator=generator)
     order[:, :blind] = 2.0  # behind all others
+    # row b draws ends[b + 1] - ends[b] states: rows differ by one at most
     ends = torch.arange(batch_size + 1, device=device) * number // batch_size
-    rank = order.argsort(1).argsort(1)
+    rank = order.argsort(1).argsort(1)  # each state's place in the random order of its row
     return (rank < ends.diff()[:, None]).flatten().nonzero().squeeze(1)
 
 
@@ -97,6 +98,7 @@ def actor_loss(
     """
     assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
     weight = actor_weight(gamma, entropy, goes_on)
+    # Not in place: in the authors' code the entropy leaks into the critic's target by that.
     objective = lambda_return[:, 1:] / return_scale + ent_coef * entropy[:, :-1]
     return -(weight * objective).mean()
 
@@ -164,7 +166,7 @@ class Actor(Head):
     """
 
     def __init__(self, size: Size, action_dim: int, outscale: float = 1.0) -> None:
-        super().__init__(size, 3, 2 * action_dim)
+        super().__init__(size, 3, 2 * action_dim)  # 3 layers: Table 2
         with torch.no_grad():
             for parameter in self.layers[-1].parameters():
                 parameter.mul_(outscale)
@@ -181,6 +183,7 @@ class Actor(Head):
     def truncated(outputs: Tensor, mask: Tensor) -> TruncatedNormal:
         """Return the distribution that the network's outputs (..., 2 A) parametrise."""
         mean, std = outputs.float().chunk(2, -1)
+        # The 2 makes exploration wide at first: a network that outputs 0 has a deviation of 0.89.
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
 
 
@@ -188,7 +191,7 @@ class Critic(Head):
     """v(V | s): a distribution over returns, two-hot in symlog space."""
 
     def __init__(self, size: Size, zero_init: bool = False) -> None:
-        super().__init__(size, 3, BINS, zero_init)
+        super().__init__(size, 3, BINS, zero_init)  # 3 layers: Table 2
 
     def value(self, feat: Tensor) -> Tensor:
         """Return the mean return: (..., D + S*K) -> (...)."""

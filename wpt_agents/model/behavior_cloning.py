@@ -100,6 +100,7 @@ class PriorActor(nn.Module):
 
     def __init__(self, size: Size, action_dim: int) -> None:
         super().__init__()
+        # 48 channels at the paper's size, as the authors' clone has.
         self.encoder = Encoder(max(size.depth // 2, 8), 3 * FRAMES)
         self.layers = nn.Sequential(
             LinearNorm(self.encoder.embed_dim, size.units),
@@ -116,4 +117,5 @@ class PriorActor(nn.Module):
     def act(self, image: Tensor, mask: Tensor) -> Tensor:
         """(N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1], zero in the padding."""
         action: Tensor = self(image)
+        # Clipped only here: a loss on clipped actions has no gradient beyond the limits.
         return action.clamp(-1, 1) * mask

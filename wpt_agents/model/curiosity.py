@@ -25,6 +25,7 @@ class Scale(nn.Module):
     def see(self, surprise: Tensor) -> None:
         """Update the mean with one batch; the first batch counts in full."""
         self.mean.mul_(self.keep).add_((1 - self.keep) * surprise.detach().mean())
+        # the sum of the weights so far: dividing by it removes the bias towards the initial 0
         self.weight.mul_(self.keep).add_(1 - self.keep)
 
     def forward(self, surprise: Tensor) -> Tensor:

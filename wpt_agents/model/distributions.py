@@ -54,6 +54,7 @@ def exponential(like: Tensor, generator: Noise = None) -> Tensor:
         return generator.next()
     if not isinstance(generator, Share):
         return torch.empty_like(like).exponential_(generator=generator)
+    # Draw for all rows and keep a share: a row's numbers must not depend on who computes it.
     whole = like.new_empty(generator.rows, *like.shape[1:]).exponential_(generator=generator)
     return whole[generator.first : generator.first + len(like)]
 
@@ -86,6 +87,7 @@ def two_hot_mean(logits: Tensor) -> Tensor:
     """Symexp of the mean bin: (..., bins) logits -> (...)."""
     logits = logits.float()
     bins = torch.linspace(-20, 20, logits.shape[-1], device=logits.device)
+    # As in DreamerV3's first version; the later one averages symexp-spaced bins instead.
     return symexp((logits.softmax(-1) * bins).sum(-1))  # a matmul would fall to bfloat16
 
 
@@ -150,6 +152,7 @@ class TruncatedNormal:
     """
 
     def __init__(self, mean: Tensor, std: Tensor, mask: Tensor) -> None:
+        # The tails of a cumulative distribution need more digits than bfloat16 has.
         self.mean = mean.float()
         self.std = std.float()
         self.mask = mask
@@ -182,6 +185,7 @@ class TruncatedNormal:
         With α and β the standardised bounds and Z the mass between them, it is
         ln(sqrt(2πe) s Z) + (α φ(α) - β φ(β)) / (2 Z).
         """
+        # The authors estimate the entropy from one sample of the normal before clamping.
         tails = (self.low * _pdf(self.low) - self.high * _pdf(self.high)) / (2 * self.mass)
         constant = 0.5 * math.log(2 * math.pi * math.e)
         return ((constant + self.std.log() + self.mass.log() + tails) * self.mask).sum(-1)

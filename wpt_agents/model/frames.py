@@ -43,7 +43,7 @@ class FrameEncoder(nn.Module):
         x = image.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255 - self.centre
         for layer in self.layers:
             x = F.relu(layer(x))
-        return x.flatten(1)
+        return x.flatten(1)  # no norm and no pooling: DrQ-v2's `Trunk` normalises what follows
 
 
 class Trunk(nn.Sequential):

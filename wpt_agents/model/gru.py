@@ -46,6 +46,7 @@ class BlockGRU(nn.Module):
         hidden = F.silu(self.norm(hidden))
         reset, candidate, update = split_gates(self.gates(hidden), self.blocks, self.layout)
         update = torch.sigmoid(update - 1)  # the GRU starts out remembering, as in DreamerV3
+        # Reset multiplies the candidate instead of h, so that one layer computes all three gates.
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         after = update * candidate + (1 - update) * before
         return after.flatten(1)

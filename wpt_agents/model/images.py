@@ -39,6 +39,8 @@ class Encoder(nn.Module):
         channels = (channels_in, depth, 2 * depth, 4 * depth, 8 * depth)
         layers: list[nn.Module] = []
         for inputs, outputs in itertools.pairwise(channels):
+            # 4 x 4 kernels without padding, as in DreamerV2; DreamerV3's encoder would not have the
+            # parameters that the paper counts.
             layers += [DownConv(inputs, outputs, 4), ChannelNorm(outputs), nn.SiLU()]
         self.layers = nn.Sequential(*layers)
         self.depth = depth
@@ -65,7 +67,7 @@ class Decoder(nn.Module):
     def __init__(self, size: Size) -> None:
         super().__init__()
         width = 2 * size.hidden
-        code = 32 * size.depth
+        code = 32 * size.depth  # as wide as the encoder's output
         depth = size.depth
         self.from_deter = nn.Sequential(
             BlockLinear(size.deter, width, size.blocks),
@@ -77,6 +79,7 @@ class Decoder(nn.Module):
             LinearNorm(size.stoch * size.classes, width, size.norm_eps), Linear(width, code)
         )
         self.layers = nn.Sequential(
+            # Kernels of 5, 5, 6 and 6 end at 64 pixels exactly.
             UpConv(code, 4 * depth, 5),
             ChannelNorm(4 * depth),
             nn.SiLU(),

@@ -70,6 +70,7 @@ class RSSM(nn.Module):
         self.unimix = unimix
         code = size.stoch * size.classes
         self.gru = BlockGRU(size, action_dim)
+        # Two hidden layers here and one in the posterior: the paper's 280 M parameters ask for it.
         self.prior_net = nn.Sequential(
             LinearNorm(size.deter, size.hidden, size.norm_eps),
             LinearNorm(size.hidden, size.hidden, size.norm_eps),
@@ -153,6 +154,7 @@ class RSSM(nn.Module):
         :return: the posterior Latent (B, T, ...), and post_logits, prior_logits (B, T, S, K)
         """
         post, post_logits = self.filter(embed, action, is_first, state, generator, sample)
+        # Filtering never needs the prior, so it is one product for all steps.
         return post, post_logits, self.prior(post.deter)
 
     def filter(
@@ -168,6 +170,7 @@ class RSSM(nn.Module):
         batch, length = is_first.shape
         assert embed.shape[:2] == action.shape[:2] == (batch, length), (embed.shape, action.shape)
         keep = (~is_first[..., None]).to(embed.dtype)
+        # The action that led to an episode's first image belongs to the episode before.
         action_embed = self.gru.from_action(action * keep)
         state = state or self.initial(batch)
         return filter_sequence(

@@ -39,7 +39,7 @@ class Size:
     units: int
     learning_rate: float = 1e-4  # Table 2
     actor_critic_learning_rate: float = 8e-5  # Table 2
-    stabilised: bool = True
+    stabilised: bool = True  # not in the paper, but in every size below its own (docs/paper.md)
     blocks: int = 8  # as in DreamerV3
     gates: str = "within"
     norm_eps: float = NORM_EPS
@@ -66,6 +66,7 @@ class Size:
 # the world model have the 280 M parameters of the text (tests/model/test_world_model.py counts).
 # The others are ours: small enough for a CPU, with learning rates that grow as widths shrink.
 SIZES = {
+    # `mid` has more groups of z and a wider h, in proportion, as DreamerV3's smallest preset does.
     "debug": Size(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
     "tiny": Size(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
     "mid": Size(512, 128, 32, 8, 16, 256, 6e-4, 3e-4, imagine_starts=128),

@@ -17,6 +17,7 @@ from wpt_agents.data.trajectory import Trajectory
 
 def similarity(x: Tensor, y: Tensor) -> Tensor:
     """S(x, y) = -||x - y||_2: (..., Z), (..., Z) -> (...)."""
+    # Clamped, because the square root has no gradient at 0.
     return -(x - y).square().sum(-1).clamp_min(1e-12).sqrt()
 
 
@@ -43,6 +44,7 @@ def time_contrastive_loss(z: Tensor, others: Tensor) -> Tensor:
 
 def r3m_loss(z: Tensor, others: Tensor) -> Tensor:
     """The time-contrastive loss + 1e-5 E||z||_1 + 1e-5 E||z||_2: (B, 3, Z), (K, B) -> scalar."""
+    # 1e-5 and 1e-5: the weights of the published code.
     size = z.abs().sum(-1).mean() + z.square().sum(-1).clamp_min(1e-12).sqrt().mean()
     return time_contrastive_loss(z, others) + 1e-5 * size
 

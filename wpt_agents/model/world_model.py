@@ -34,6 +34,7 @@ def squared_error(image: Tensor, reconstruction: Tensor, weight: Tensor | None =
     :return: (...), summed over a frame
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
+    # Without the 1/2 of a unit variance, as in the authors' code: it would change what beta means.
     error = F.mse_loss(reconstruction, image, reduction="none")
     return (error if weight is None else weight * error).sum((-3, -2, -1))
 
@@ -92,7 +93,7 @@ def world_model_loss(
     if free_nats_mode == "mean":
         dyn = dyn.mean()
         rep = rep.mean()
-    kl = dyn.mean().detach()
+    kl = dyn.mean().detach()  # for the log, before free nats clip it
     dyn = dyn.clamp_min(free_nats).mean()
     rep = rep.clamp_min(free_nats).mean()
     return WorldModelLoss(error + dyn_scale * dyn + rep_scale * rep, error, kl)
@@ -106,6 +107,7 @@ def reward_loss(logits: Tensor, reward: Tensor, known: Tensor) -> Tensor:
     :param known: (B, T) bool
     """
     assert logits.shape[:-1] == reward.shape == known.shape, (logits.shape, known.shape)
+    # a batch of retrieved rows alone has no known reward: its loss is 0, not NaN
     return (two_hot_loss(logits, reward) * known).sum() / known.sum().clamp_min(1)
 
 
@@ -133,6 +135,7 @@ class WorldModel(nn.Module):
 
     def reset_reward_head(self) -> None:
         """Draw new weights for what belongs to a task: rewards do, and where episodes end."""
+        # Two layers, as in the authors' code; Table 2 says three for all heads.
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
         self.continue_head: Head | None = None
 

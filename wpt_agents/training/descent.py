@@ -12,6 +12,7 @@ def adam(parts: list[list[nn.Parameter]], rate: float, weight_decay: float) -> O
     :param weight_decay: share by which every weight shrinks in a step
     """
     groups = [{"params": part} for part in parts]
+    # eps and weight decay: Table 2. The paper's decay is a share of the weights in each step.
     return AdamW(groups, rate, eps=1e-5, weight_decay=decay(rate, weight_decay), fused=True)
 
 
@@ -36,6 +37,7 @@ def take_step(optimizer: Optimizer, loss: Tensor, name: str, grad_clip: float) -
     """Clip the gradients, check that they and the loss are finite, and take a step."""
     groups = [group["params"] for group in optimizer.param_groups]
     norms = [clip_grad_norm_(weights, grad_clip) for weights in groups]
+    # one test for all of them: reading a number waits for the GPU
     if not torch.isfinite(sum(norms, loss.detach())):
         raise FloatingPointError(
             f"The {name} loss is {loss.item()}, its gradient norm {float(sum(norms))}. This step "

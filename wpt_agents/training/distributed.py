@@ -195,6 +195,7 @@ class Divided:
             with self._in_step(last=i + 1 == self.passes):
                 with self.autocast():
                     loss = self.objective(part, self._draws(part, i, seed), whole)
+                # Passes have equally many rows, so the mean of their losses is the batch's.
                 (loss.total / self.passes).backward()
             losses.append(torch.stack([term.detach() for term in loss]))
         return WorldModelLoss(*self.world.mean(torch.stack(losses).mean(0)))

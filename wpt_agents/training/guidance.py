@@ -65,5 +65,6 @@ def draw_window(probability: float, length: int, rng: np.random.Generator) -> tu
     if rng.random() >= probability:
         return 0, 0
     duration = max(1, round(rng.choice(SHARES) * length))
+    # Half-open, and uniform over all windows that fit; the paper prints k <= t <= H.
     start = int(rng.integers(0, length - duration + 1))
     return start, start + duration

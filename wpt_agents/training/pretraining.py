@@ -52,17 +52,18 @@ def world_model_updates(
         share=world.share(settings.batch_size),
         mark=settings.marks,
     )
+    # The divided update agrees to rounding only, and several passes cost one more forward pass.
     if world.size == accumulate == 1:
         update = whole_update(learner, streams)
     else:
         update = divided_update(learner, streams, world, accumulate)
     shown = progress_bar and world.rank == 0
     bar = tqdm(total=steps, initial=start, desc="pre-train", disable=not shown)
-    with bar, closing(batches):
+    with bar, closing(batches):  # closing ends the thread that reads ahead
         for step, batch in zip(range(start, steps), batches, strict=False):
             metrics = update(batch, step)
             yield metrics
-            if step % 20 == 0:
+            if step % 20 == 0:  # reading a loss waits for the GPU
                 loss = float(metrics["train/reconstruction_loss"])
                 bar.set_postfix(reconstruction=f"{loss:.1f}")
             bar.update()

@@ -86,6 +86,7 @@ class Rollout:
         """
         for i in np.flatnonzero(self.first):
             self.windows[i] = self.draw_window()
+        # Kept at every step, because the guide's window may begin at any.
         self.frames = stack_frames(image, self.frames, self.first)
         action, state = self.policy.act(image, self.state, self.first, generator=self.generator)
         time = np.array([len(actions) for actions in self.actions])
@@ -93,9 +94,10 @@ class Rollout:
         guided = (start <= time) & (time < stop)
         if guided.any():
             action[guided] = self.guide(self.frames[guided])
+        # The RSSM must see what was done, whoever decided: it predicts from actions.
         self.state = self.policy.executed(state, action)
         for i, (frame, row) in enumerate(zip(image, action, strict=True)):
-            self.images[i].append(frame.copy())
+            self.images[i].append(frame.copy())  # the environment may draw into it
             self.actions[i].append(row[: self.action_dim].copy())
         return action
 

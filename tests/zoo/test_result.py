@@ -25,6 +25,7 @@ RESULT = Result(
     updates=7,
     cpu_seconds=1.5,
     model="0123456789ab",
+    pretrained="ba9876543210",
 )
 
 

@@ -1,6 +1,7 @@
 """The runner end to end, on a toy task and the smallest networks."""
 
 import csv
+import hashlib
 import io
 import json
 from contextlib import closing
@@ -32,8 +33,8 @@ from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.plan.runs import Run, make_plan
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.report import tables
-from wpt_agents.zoo.report.folders import read_results
+from wpt_agents.zoo.report import record, tables
+from wpt_agents.zoo.report.folders import find_finished, read_results
 from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
 from wpt_agents.zoo.run import learning, runner, shared
 from wpt_agents.zoo.run.runner import run
@@ -110,6 +111,13 @@ def test_a_run_leaves_everything_in_one_folder(tmp_path):
     assert yaml.safe_load((one.folder / "config.yaml").read_text()) == one.config()
     assert read_result(one.folder) == result
     assert result.updates > 0 and result.cpu_seconds > 0 and len(result.model) == 12
+    start = (one.shared.model_path / "model.zip").read_bytes()
+    assert result.pretrained == hashlib.sha256(start).hexdigest()[:12]
+    lines = record.lines_of(find_finished(tmp_path))
+    assert [(each.policy, each.model_hash) for each in lines if each.frames] == [
+        ("prior actor", result.pretrained),
+        ("last", result.pretrained),
+    ]
 
 
 def test_sb3_reads_the_run_folder_and_wpt_its_model(tmp_path):

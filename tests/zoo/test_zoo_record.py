@@ -102,7 +102,7 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     ]
     assert path.read_text().splitlines()[0] == (
         "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command,"
-        "updates,cpu_seconds,model"
+        "updates,cpu_hours,model_hash,policy"
     )
 
 

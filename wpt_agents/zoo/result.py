@@ -142,6 +142,7 @@ class Result:
     :param updates: gradient updates of fine-tuning, None if the agent does not count them
     :param cpu_seconds: processor seconds of the learning process, None in results of version 0.1
     :param model: the first digits of the SHA-256 of the model file that counts
+    :param pretrained: likewise of the pre-trained model that fine-tuning began with, None without
     """
 
     suite: str
@@ -158,6 +159,7 @@ class Result:
     updates: int | None = None
     cpu_seconds: float | None = None
     model: str | None = None
+    pretrained: str | None = None
 
     @property
     def final_policy(self) -> str:

@@ -27,8 +27,10 @@ class Line:
     :param score: 0 to 100 as in the paper: the return / 10, or the share of successes x 100
     :param hours: of the whole run, shared stages that it had to make included
     :param updates: gradient updates of fine-tuning; None where unknown, as in version 0.1
-    :param cpu_seconds: processor seconds of fine-tuning; None where unknown
-    :param model: the first digits of the SHA-256 of the model file; "" where unknown
+    :param cpu_hours: processor hours of fine-tuning; None where unknown
+    :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
+        fine-tuning began with; "" without one, or where unknown
+    :param policy: one of `POLICIES`; "" in records of version 0.1
     """
 
     suite: str
@@ -44,8 +46,9 @@ class Line:
     commit: str
     command: str
     updates: int | None = None
-    cpu_seconds: float | None = None
-    model: str = ""
+    cpu_hours: float | None = None
+    model_hash: str = ""
+    policy: str = ""
 
     @property
     def run(self) -> tuple[str, str, str, int, int]:
@@ -59,7 +62,7 @@ KNOWN = (  # of methods in tables: the simplest first, then the paper's ablation
 )
 ORDER = (*KNOWN, *(name for name in METHODS if name not in KNOWN))
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
-OPTIONAL = ("updates", "cpu_seconds", "model")  # columns that records of version 0.1 lack
+OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy")  # records of version 0.1 lack them
 
 
 def lines_of(runs: Iterable[Finished]) -> list[Line]:
@@ -87,9 +90,14 @@ def _lines(result: Result) -> Iterator[Line]:
             commit=result.commit_name,
             command=result.command,
             updates=result.updates if trained else None,
-            cpu_seconds=result.cpu_seconds if trained else None,
-            model=(result.model or "") if trained else "",
+            cpu_hours=_hours(result.cpu_seconds) if trained else None,
+            model_hash=(result.pretrained or "") if trained else "",
+            policy=policy,
         )
+
+
+def _hours(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds / 3600, 4)
 
 
 def order(line: Line) -> tuple[str, str, int, str, str, int, int]:
@@ -145,7 +153,7 @@ PARSERS: Mapping[str, Callable[[str], Any]] = {
     "success": lambda text: float(text) if text else None,
     "hours": float,
     "updates": lambda text: int(text) if text else None,
-    "cpu_seconds": lambda text: float(text) if text else None,
+    "cpu_hours": lambda text: float(text) if text else None,
 }
 
 

@@ -56,10 +56,15 @@ def final_agent(run: Run, agent: BaseAlgorithm) -> BaseAlgorithm:
     return run.algorithm.agent.load(best, device=run.device) if best.exists() else agent
 
 
-def model_hash(folder: Path) -> str:
-    """Return the first digits of the SHA-256 of the model file that counts."""
+def final_model(folder: Path) -> Path:
+    """Return the model file that counts: the best one if the run kept it, else the last."""
     best = folder / BEST_MODEL
-    with open(best if best.exists() else folder / "model.zip", "rb") as file:
+    return best if best.exists() else folder / "model.zip"
+
+
+def file_hash(path: Path) -> str:
+    """Return the first digits of a file's SHA-256."""
+    with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:12]
 
 

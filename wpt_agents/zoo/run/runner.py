@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import yaml
 from rich.markup import escape
@@ -20,7 +21,7 @@ from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.result import Metric, Result, Score, read_result, write_result
 from wpt_agents.zoo.run.checkpoints import LOGS, Checkpoint, last_checkpoint, remove_checkpoints
-from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, model_hash
+from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
 from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
 from wpt_agents.zoo.run.locks import locked, write_json
@@ -122,7 +123,7 @@ def do_stages(job: Run) -> Result:
         scores = evaluate_policies(job, agent)
     with clock("pictures"):
         draw(job, agent, scores)
-    result = make_result(job, agent, scores, clock.seconds, effort)
+    result = make_result(job, agent, scores, clock.seconds, effort, start)
     write_result(job.folder, result)
     remove_checkpoints(job.folder)
     return result
@@ -150,6 +151,7 @@ def make_result(
     scores: Mapping[str, Score],
     seconds: Mapping[str, float],
     effort: Effort,
+    start: Path | None,
 ) -> Result:
     """Put together the result of a run."""
     return Result(
@@ -166,5 +168,6 @@ def make_result(
         commit=commit(),
         updates=getattr(agent, "updates", getattr(agent, "_n_updates", None)),
         cpu_seconds=round(effort.cpu_seconds, 1),
-        model=model_hash(job.folder),
+        model=file_hash(final_model(job.folder)),
+        pretrained=file_hash(start) if start is not None else None,
     )

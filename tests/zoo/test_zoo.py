@@ -114,7 +114,7 @@ def test_a_run_leaves_everything_in_one_folder(tmp_path):
     start = (one.shared.model_path / "model.zip").read_bytes()
     assert result.pretrained == hashlib.sha256(start).hexdigest()[:12]
     lines = record.lines_of(find_finished(tmp_path))
-    assert [(each.policy, each.model_hash) for each in lines if each.frames] == [
+    assert [(line.policy, line.model_hash) for line in lines if line.frames] == [
         ("prior actor", result.pretrained),
         ("last", result.pretrained),
     ]

@@ -11,6 +11,7 @@ from wpt_agents.files import moved
 if TYPE_CHECKING:  # for editors and type checkers
     from wpt_agents.agents.drqv2 import DrQv2
     from wpt_agents.agents.jsrl import JSRL
+    from wpt_agents.agents.mrq import MRQ
     from wpt_agents.agents.packnet import PackNet
     from wpt_agents.agents.r3m import R3M
     from wpt_agents.agents.rlpd import RLPD
@@ -25,6 +26,7 @@ PUBLIC = {
     "Trajectory": "wpt_agents.data.trajectory",
     "DrQv2": "wpt_agents.agents.drqv2",
     "JSRL": "wpt_agents.agents.jsrl",
+    "MRQ": "wpt_agents.agents.mrq",
     "PackNet": "wpt_agents.agents.packnet",
     "R3M": "wpt_agents.agents.r3m",
     "RLPD": "wpt_agents.agents.rlpd",
@@ -32,6 +34,7 @@ PUBLIC = {
 }
 __all__ = [
     "JSRL",
+    "MRQ",
     "R3M",
     "RLPD",
     "WPT",

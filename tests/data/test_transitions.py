@@ -6,7 +6,13 @@ import torch
 import torch.nn.functional as F
 
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.data.transitions import concatenate, draw_transitions, n_step_return, random_shift
+from wpt_agents.data.transitions import (
+    concatenate,
+    draw_steps,
+    draw_transitions,
+    n_step_return,
+    random_shift,
+)
 
 
 def episode(length=5, terminated=False, actions=2, rewards=True):
@@ -115,3 +121,35 @@ def test_both_observations_are_shifted_and_by_different_offsets():
     moved = [[bool((x != shown).any()) for x in side] for side in (batch.image, batch.next_image)]
     assert np.mean(moved) > 0.9  # one shift of 81 is none
     assert (batch.image != batch.next_image).flatten(1).any(1).float().mean() > 0.9
+
+
+def test_steps_in_a_row_by_hand():
+    rng = np.random.default_rng(0)
+    batch = draw_steps([episode(5, terminated=True)], 200, 3, 2, rng)
+    firsts = batch.image[:, -1, 0, 0, 0]
+    assert set(firsts.tolist()) == {0, 1, 2, 3, 4}  # every step may be the first one
+    for row, first in enumerate(firsts.tolist()):
+        steps = [min(first + i, 4) for i in range(3)]
+        assert batch.image[row, :, 0, 0, 0].tolist() == [max(first + i, 0) for i in (-2, -1, 0)]
+        assert batch.next_image[row, :, -1, 0, 0, 0].tolist() == [
+            min(first + i, 5) for i in (1, 2, 3)
+        ]
+        np.testing.assert_allclose(batch.action[row, :, 0], np.array(steps) / 10, rtol=1e-6)
+        assert batch.reward[row].tolist() == [t + 1 for t in steps]
+        assert batch.inside[row].tolist() == [float(first + i < 5) for i in range(3)]
+        assert batch.end[row].tolist() == [float(t == 4) for t in steps]
+
+
+def test_a_time_limit_is_no_end_and_episodes_shorter_than_the_horizon_are_drawn():
+    batch = draw_steps([episode(2)], 50, 5, 3, np.random.default_rng(0), pad=4)
+    assert (batch.end == 0).all() and (batch.action[..., 2] == 0).all()
+    assert set(batch.inside.sum(1).tolist()) == {1.0, 2.0}
+
+
+def test_the_frames_of_each_stack_are_shifted_alike_and_the_stacks_independently():
+    rng = np.random.default_rng(0)
+    image = np.repeat(rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8), 6, 0)
+    still = Trajectory(image, np.zeros((5, 2)), np.zeros(5))
+    batch = draw_steps([still], 20, 2, 2, rng, pad=4)
+    assert (batch.next_image[:, :, 0] == batch.next_image[:, :, 2]).all()
+    assert (batch.next_image[:, 0] != batch.next_image[:, 1]).flatten(1).any(1).float().mean() > 0.9

@@ -76,6 +76,17 @@ SECTIONS = {
     "jsrl": {"bc_size": "debug", "bc_steps": 2, "bc_batch_size": 4, "warmup_steps": 0},
     "r3m": {"clips": 4},
     "rlpd": MODEL_FREE | {"critics": 2, "reward_members": 2, "num_retrieve": 3},
+    "mrq": {
+        "channels": 2,
+        "latent_dim": 8,
+        "hidden_dim": 8,
+        "batch_size": 4,
+        "horizon": 2,
+        "sync_every": 2,
+        "update_every": 10,
+        "learning_starts": 25,
+        "warmup_steps": 25,
+    },
     "sac": {"buffer_size": 100, "learning_starts": 25, "batch_size": 4, "train_freq": 10},
 }
 

@@ -1,12 +1,19 @@
 import csv
 import re
+from contextlib import closing
 from statistics import mean, median
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from debug_agent import recorded
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.plan import presets
+from wpt_agents.zoo.plan.methods import METHODS, defaults
 from wpt_agents.zoo.plan.presets import (
     load_preset,
     preset_folder,
@@ -15,6 +22,7 @@ from wpt_agents.zoo.plan.presets import (
     suite_names,
 )
 from wpt_agents.zoo.plan.runs import make_plan, parse_seeds
+from wpt_agents.zoo.run.learning import make_agent
 from wpt_agents.zoo.tasks import find_tasks
 
 ALL = [(suite, name) for suite in suite_names() for name in preset_names(suite)]
@@ -206,6 +214,49 @@ def plan(suite, tasks, preset, tmp_path, method="wpt", settings=(), data=None):
 @pytest.mark.parametrize("preset", ["debug", "paper"])
 def test_a_whole_suite_can_be_run_from_its_presets_own_data(suite, preset, tmp_path):
     assert plan(suite, [], preset, tmp_path)
+
+
+TASK_OF = {"dmc": "walker-run", "metaworld": "reach", "robotics": "fetch-reach"}
+SMALL = [(suite, name) for suite, name in ALL if name in ("debug", "tiny")]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_can_be_planned_from_every_preset(method, tmp_path):
+    for suite, preset in ALL:
+        [run] = plan(suite, [TASK_OF[suite]], preset, tmp_path, method)
+        agent = run.algorithm.agent
+        assert run.keywords.keys() <= defaults(agent).keys(), (suite, preset)
+        if issubclass(agent, PixelAgent):
+            agent.keywords.of(run.keywords)  # names and ranges
+        assert run.config() and run.folder and run.shared.model_path
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_is_built_from_the_small_presets(method, tmp_path):
+    for suite, preset in SMALL:
+        [run] = plan(suite, [TASK_OF[suite]], preset, tmp_path, method)
+        actions = spaces.Box(-1.0, 1.0, (run.task.action_dim,), np.float32)
+        with closing(DummyVecEnv([lambda box=actions: Still(box)])) as venv:
+            wrapped = run.algorithm.wrap(venv) if run.algorithm.wrap else venv
+            agent = make_agent(run, wrapped, None, None)
+            action, _ = agent.predict(wrapped.reset(), deterministic=True)
+        assert action.shape == (1, run.task.action_dim), (suite, preset)
+
+
+class Still(gym.Env):
+    """An environment of a task's spaces in which nothing happens."""
+
+    observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+
+    def __init__(self, actions):
+        self.action_space = actions
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros((64, 64, 3), np.uint8), {}
+
+    def step(self, action):
+        return np.zeros((64, 64, 3), np.uint8), 0.0, False, False, {}
 
 
 def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):

@@ -173,14 +173,21 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
         :param stream: another number for each batch of the same update
         """
-        # Not from `Streams`: RLPD draws two batches in an update, each with a number of its own.
-        rng = np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
+        rng = self.batch_rng(stream)
         settings = self.hyperparameters
         shape = size, n_steps, settings.gamma, self.policy.action_dim
         seen = self.seen(replay)
         pad = settings.pad if seen is None else 0  # features cannot be shifted
         batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen)
         return batch.to(self.device)
+
+    def batch_rng(self, stream: int) -> np.random.Generator:
+        """Return the random numbers of a batch of the next update.
+
+        :param stream: another number for each batch of the same update
+        """
+        # Not from `Streams`: RLPD draws two batches in an update, each with a number of its own.
+        return np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
 
     def hyperparameters_changed(self) -> None:
         """Hand the keywords to the learner, and the learning rate to its optimisers."""

@@ -44,6 +44,30 @@ class Transitions:
         return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
+@dataclass(frozen=True)
+class Steps:
+    """N times H steps in a row, of one episode each: what MR.Q's encoder learns to predict.
+
+    :param image: (N, F, 64, 64, 3) uint8, the frames up to the first step, oldest first
+    :param action: (N, H, A) float32
+    :param reward: (N, H) float32
+    :param end: (N, H) float32, 1 where the step led to a terminal state
+    :param inside: (N, H) float32, 0 for steps behind the end of the episode
+    :param next_image: (N, H, F, 64, 64, 3) uint8, the frames up to what each step led to
+    """
+
+    image: Tensor
+    action: Tensor
+    reward: Tensor
+    end: Tensor
+    inside: Tensor
+    next_image: Tensor
+
+    def to(self, device: torch.device | str) -> "Steps":
+        """The same steps on `device`."""
+        return Steps(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
 def random_shift(image: np.ndarray, pad: int, rng: np.random.Generator) -> np.ndarray:
     """Shift each stack of frames by up to `pad` pixels in both directions, repeating the border.
 
@@ -141,3 +165,51 @@ def draw_transitions(
     now, then = (random_shift(side, pad, rng) if pad else side for side in image)
     tensors = [torch.from_numpy(array) for array in (now, action, *outcome, then)]
     return Transitions(*tensors)
+
+
+def draw_steps(
+    trajectories: Sequence[Trajectory],
+    size: int,
+    horizon: int,
+    action_dim: int,
+    rng: np.random.Generator,
+    pad: int = 0,
+    frames: int = 3,
+) -> Steps:
+    """Draw steps in a row, every first step equally likely.
+
+    An episode may end before the last of the H steps; its last step is then repeated.
+
+    :param size: N
+    :param horizon: H
+    :param action_dim: A; narrower actions are padded with zeros
+    :param pad: pixels by which each stack of frames is shifted at most, independently
+    :param frames: F, the images in a stack
+    :raises ValueError: there is no trajectory
+    """
+    if not trajectories:
+        raise ValueError("There are no episodes to draw steps from; collect some first")
+    starts = np.cumsum([len(trajectory) for trajectory in trajectories])
+    drawn = rng.integers(starts[-1], size=size)
+    chosen = np.searchsorted(starts, drawn, side="right")
+    begin = drawn - np.concatenate([[0], starts])[chosen]
+    shape = trajectories[0].image.shape[1:]
+    images = np.empty((size, horizon + 1, frames, *shape), np.uint8)
+    action = np.zeros((size, horizon, action_dim), np.float32)
+    outcome = np.zeros((3, size, horizon), np.float32)
+    before = np.arange(1 - frames, 1)
+    for row, (i, first) in enumerate(zip(chosen, begin, strict=True)):
+        trajectory = trajectories[i]
+        length = len(trajectory)
+        times = np.minimum(first + np.arange(horizon + 1), length)
+        images[row] = trajectory.image[np.maximum(times[:, None] + before, 0)]
+        steps = np.minimum(times[:-1], length - 1)
+        action[row, :, : trajectory.action_dim] = trajectory.action[steps, : trajectory.action_dim]
+        if trajectory.reward is not None:
+            outcome[0, row] = trajectory.reward[steps]
+        outcome[1, row] = trajectory.terminated & (steps == length - 1)
+        outcome[2, row] = first + np.arange(horizon) < length
+    if pad:
+        images = random_shift(images.reshape(-1, frames, *shape), pad, rng).reshape(images.shape)
+    arrays = images[:, 0], action, *outcome, images[:, 1:]
+    return Steps(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))

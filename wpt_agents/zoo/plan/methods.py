@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.jsrl import JSRL
+from wpt_agents.agents.mrq import MRQ
 from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.rlpd import RLPD
@@ -46,6 +47,7 @@ RESERVED = {
 AGENTS: dict[str, type[BaseAlgorithm]] = {
     "drqv2": DrQv2,
     "jsrl": JSRL,
+    "mrq": MRQ,
     "packnet": PackNet,
     "r3m": R3M,
     "rlpd": RLPD,
@@ -156,6 +158,8 @@ METHODS = {
     "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
     # An upper bound for the two before it: with --data that hold rewards (`collect --rewards`).
     "rlpd": Method(RLPD, {"label": "true"}, **MODEL_FREE),
+    # From after the paper: the strongest model-free method that a CPU can run.
+    "mrq": Method(MRQ, **MODEL_FREE, needs_data=False),
     # As SB3 ships it: what a user has without this library.
     "sac": Method(SAC, **MODEL_FREE, needs_data=False, wrap=stacked),
 }

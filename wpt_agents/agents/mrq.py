@@ -1,0 +1,300 @@
+"""MR.Q (Fujimoto et al., 2025): TD3 on features that predict reward, next features and end.
+
+Source: https://arxiv.org/abs/2501.16142. It came after the paper and is not among its baselines.
+"""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from math import inf
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from torch import Generator, Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW
+
+from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, FrameProgress, descend
+from wpt_agents.data.transitions import Steps, Transitions, draw_steps
+from wpt_agents.model.frame_policy import FramePolicy
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.mrq import (
+    ModelEncoder,
+    NormedMLP,
+    ValuePair,
+    actor_loss,
+    encoder_loss,
+    noisy,
+    scaled_target,
+    value_loss,
+    xavier_relu,
+)
+from wpt_agents.model.sizes import Size
+from wpt_agents.training.keywords import Stage, amount, count
+from wpt_agents.training.model_files import optimizers
+from wpt_agents.training.randomness import Purpose
+
+LEAST_SCALE = 1e-8  # of rewards, where all are zero
+
+
+@dataclass(frozen=True, kw_only=True)
+class MRQKeywords(FrameKeywords):
+    """The keywords of `MRQ`; the defaults are the published ones, the same for all tasks."""
+
+    channels: int = count(32, "channels of each of the encoder's four layers", Stage.SIZE)
+    latent_dim: int = count(512, "width of the features", Stage.SIZE)
+    hidden_dim: int = count(512, "width of all hidden layers", Stage.SIZE)
+    learning_rate: float = amount(3e-4, "learning rate of actor and value functions")
+    encoder_learning_rate: float = amount(1e-4, "learning rate of the encoder")
+    weight_decay: float = amount(1e-4, "weight decay of AdamW")
+    n_steps: int = count(3, "rewards that are summed before the value functions take over")
+    horizon: int = count(5, "steps that the encoder predicts in a row")
+    sync_every: int = count(
+        250,
+        "updates between two copies of all networks to their targets; the encoder makes as many "
+        "updates then",
+    )
+    reward_weight: float = amount(0.1, "weight of the reward in the encoder's loss")
+    end_weight: float = amount(0.1, "weight of the episode's end in the encoder's loss")
+    pre_activation: float = amount(1e-5, "weight of the actor's squared output before tanh")
+    grad_clip: float = amount(20.0, "largest norm of the value functions' gradient")
+    std: float = amount(0.2, "standard deviation of the noise on actions, also in targets")
+    std_clip: float = amount(0.3, "largest noise in targets")
+    update_every: int = count(1, "collected steps that pay for one update")
+    learning_starts: int = count(
+        10_000, "steps that are collected before the first update", Stage.ACTING, least=0
+    )
+    warmup_steps: int = count(
+        10_000,
+        "steps at the start that uniform random actions drive, to the end of the episode",
+        Stage.ACTING,
+        least=0,
+    )
+
+
+@dataclass(kw_only=True)
+class MRQProgress(FrameProgress):
+    """How far an agent has come.
+
+    :ivar scale: mean absolute reward when the targets were last copied
+    :ivar target_scale: that of the copy before
+    """
+
+    scale: float = 1.0
+    target_scale: float = 0.0
+
+
+class MRQPolicy(FramePolicy):
+    """Encoder, actor, value functions, and a target of each.
+
+    :param channels: of each of the encoder's four layers
+    :param latent_dim: width of the features
+    :param hidden_dim: width of all hidden layers
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        clone_size: Size | None = None,
+        channels: int = 32,
+        latent_dim: int = 512,
+        hidden_dim: int = 512,
+    ) -> None:
+        self.widths = channels, latent_dim, hidden_dim
+        super().__init__(observation_space, action_space, clone_size)
+
+    def build(self) -> None:
+        """Draw the networks for actions of width `action_dim`."""
+        _, width, hidden = self.widths
+        self.encoder = ModelEncoder(*self.widths, self.action_dim)
+        self.actor = NormedMLP(width, hidden, self.action_dim, "relu")
+        self.value = ValuePair(width, hidden)
+        for network in (self.encoder, self.actor, self.value):
+            network.apply(xavier_relu)
+        self.target_encoder = deepcopy(self.encoder).requires_grad_(False)
+        self.target_actor = deepcopy(self.actor).requires_grad_(False)
+        self.target_value = deepcopy(self.value).requires_grad_(False)
+
+    def decide(
+        self, frames: Tensor, deterministic: bool, generator: Generator | None = None
+    ) -> Tensor:
+        """(N, F, 64, 64, 3) uint8 -> (N, A): the mean, or the mean and noise of deviation `std`."""
+        mean: Tensor = self.actor(self.encoder.state(frames)).tanh()
+        return mean if deterministic else noisy(mean, self.std, inf, generator)
+
+
+class MRQLearner:
+    """One update of encoder, of value functions and of actor, and the copy to the targets.
+
+    :param policy: whose networks learn
+    :param settings: rates and weights
+    """
+
+    def __init__(self, policy: MRQPolicy, settings: MRQKeywords) -> None:
+        self.policy = policy
+        self.settings = settings
+        decay = settings.weight_decay
+        rate = settings.learning_rate
+        encoder = policy.encoder.parameters()
+        self.encoder_optimizer = AdamW(encoder, settings.encoder_learning_rate, weight_decay=decay)
+        self.value_optimizer = AdamW(policy.value.parameters(), rate, weight_decay=decay)
+        self.actor_optimizer = AdamW(policy.actor.parameters(), rate, weight_decay=decay)
+
+    def copy_targets(self) -> None:
+        """Copy all networks to their targets."""
+        policy = self.policy
+        policy.target_encoder.load_state_dict(policy.encoder.state_dict())
+        policy.target_actor.load_state_dict(policy.actor.state_dict())
+        policy.target_value.load_state_dict(policy.value.state_dict())
+
+    def update_encoder(self, batch: Steps, ends: bool) -> Tensor:
+        """Take a step on the encoder's loss; return the loss.
+
+        :param batch: with shifted images
+        :param ends: whether any episode ended in a terminal state
+        """
+        settings = self.settings
+        with torch.no_grad():
+            images = batch.next_image.flatten(0, 1)
+            target = self.policy.target_encoder.state(images).unflatten(0, batch.reward.shape)
+        end_weight = settings.end_weight if ends else 0.0
+        weights = 1.0, settings.reward_weight, end_weight
+        loss = encoder_loss(self.policy.encoder, batch, target, weights)
+        descend(self.encoder_optimizer, loss, "encoder")
+        return loss.detach()
+
+    def update(
+        self,
+        batch: Transitions,
+        scale: float,
+        target_scale: float,
+        generator: Generator | None = None,
+    ) -> Mapping[str, Tensor]:
+        """Take a step of the value functions and one of the actor, on fixed features.
+
+        :param batch: with shifted images
+        :param scale: of the values
+        :param target_scale: of the target value functions
+        """
+        policy = self.policy
+        settings = self.settings
+        with torch.no_grad():
+            next_z = policy.target_encoder.state(batch.next_image)
+            next_mean = policy.target_actor(next_z).tanh()
+            next_action = noisy(next_mean, settings.std, settings.std_clip, generator)
+            next_q = policy.target_value(policy.target_encoder(next_z, next_action))
+            target = scaled_target(batch.reward, batch.discount, next_q, scale, target_scale)
+            z = policy.encoder.state(batch.image)
+            features = policy.encoder(z, batch.action)
+        q = policy.value(features)
+        loss = value_loss(q, target)
+        self._descend_value(loss)
+        with frozen(policy.encoder, policy.value):
+            before_tanh = policy.actor(z)
+            chosen = policy.value(policy.encoder(z, before_tanh.tanh()))
+            policy_loss = actor_loss(chosen, before_tanh, settings.pre_activation)
+        descend(self.actor_optimizer, policy_loss, "actor")
+        return {
+            "train/value_loss": loss.detach(),
+            "train/actor_loss": policy_loss.detach(),
+            "train/q": scale * q.detach().mean(),
+            "train/batch_reward": batch.reward.mean(),
+        }
+
+    def _descend_value(self, loss: Tensor) -> None:
+        """Take a step of the value functions with a clipped gradient."""
+
+        def clip(*_: Any) -> None:
+            clip_grad_norm_(self.policy.value.parameters(), self.settings.grad_clip)
+
+        hook = self.value_optimizer.register_step_pre_hook(clip)
+        try:
+            descend(self.value_optimizer, loss, "value")
+        finally:
+            hook.remove()
+
+
+class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
+    """MR.Q: model-free learning on features of a model, with one set of settings for all tasks.
+
+    Example::
+
+        model = MRQ("CnnPolicy", "wpt/dmc-walker-walk-v0")
+        model.learn(75_000).save("walker.zip")
+
+    :param policy: "CnnPolicy"
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": MRQPolicy}
+    saved_as = "MRQ"
+    policy: MRQPolicy
+    learner: MRQLearner
+    hyperparameters: MRQKeywords
+    progress: MRQProgress
+    shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "latent_dim", "hidden_dim")
+
+    def make_policy(self) -> MRQPolicy:
+        """Make the networks, as wide as the environment's actions."""
+        widths = [getattr(self.hyperparameters, name) for name in self.shape_keywords]
+        policy = MRQPolicy(self.observation_space, self.action_space, None, *widths)
+        policy.std = self.hyperparameters.std
+        return policy
+
+    def make_learner(self) -> MRQLearner:
+        """Make the optimisers."""
+        return MRQLearner(self.policy, self.hyperparameters)
+
+    @property
+    def updates_per_step(self) -> float:
+        """How many updates a collected step pays for."""
+        return 1 / self.hyperparameters.update_every
+
+    def update(self, metrics: Metrics) -> None:
+        """Make one update on the replay; before every `sync_every`th, those of the encoder."""
+        settings = self.hyperparameters
+        if self.updates % settings.sync_every == 0:
+            metrics["train/encoder_loss"].append(self._update_encoder())
+        batch = self.draw(self.replay_buffer, settings.batch_size, settings.n_steps)
+        generator = self.streams.torch(Purpose.UPDATE, self.updates, self.device)
+        scales = self.progress.scale, self.progress.target_scale
+        for name, value in self.learner.update(batch, *scales, generator).items():
+            metrics[name].append(value)
+        self.updates += 1
+
+    def _update_encoder(self) -> Tensor:
+        """Copy the networks to their targets, measure the rewards, and train the encoder."""
+        settings = self.hyperparameters
+        trajectories = self.replay_buffer.trajectories
+        rewards = np.concatenate([t.reward for t in trajectories if t.reward is not None])
+        self.learner.copy_targets()
+        self.progress.target_scale = self.progress.scale
+        self.progress.scale = max(float(np.abs(rewards).mean()), LEAST_SCALE)
+        ends = any(trajectory.terminated for trajectory in trajectories)
+        losses = []
+        for number in range(settings.sync_every):
+            rng = self.batch_rng(1 + number)
+            shape = settings.batch_size, settings.horizon, self.policy.action_dim
+            batch = draw_steps(trajectories, *shape, rng, settings.pad).to(self.device)
+            losses.append(self.learner.update_encoder(batch, ends))
+        return torch.stack(losses).mean()
+
+    def hyperparameters_changed(self) -> None:
+        """Hand the keywords to learner and policy, and the rates to the optimisers."""
+        super().hyperparameters_changed()
+        settings = self.hyperparameters
+        self.policy.std = settings.std
+        for group in self.learner.encoder_optimizer.param_groups:
+            group["lr"] = settings.encoder_learning_rate
+        for optimizer in optimizers(self.learner).values():
+            for group in optimizer.param_groups:
+                group["weight_decay"] = settings.weight_decay
+
+    def reset_task(self) -> None:
+        """Forget the task: episodes, all networks, and the scale of the rewards."""
+        self.progress.reset("scale", "target_scale")
+        super().reset_task()

@@ -378,6 +378,29 @@ def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula():
     assert any(p.grad.abs().sum() > 0 for p in policy.actor.parameters())
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.7])
+def test_the_slow_critic_regulariser_pulls_the_critic_to_the_target_critic(scale, monkeypatch):
+    model = filled(slow_critic_scale=scale, gamma=0.9)
+    learner, policy = model.learner, model.policy
+    for weight in policy.target_critic.parameters():  # or it would be the critic
+        weight.data.add_(0.05 * torch.randn_like(weight))
+    start, losses, descend = policy.world_model.rssm.initial(6), {}, learner.descend
+
+    def recorded(optimizer, loss, name):
+        losses[name] = loss.detach()
+        return descend(optimizer, loss, name)
+
+    monkeypatch.setattr(learner, "descend", recorded)
+    with torch.no_grad():
+        imagined = learner.imagine(start, torch.arange(6), torch.Generator().manual_seed(0))
+        logits = policy.critic(imagined.dream.states.but_last().feat)
+        weight = 0.9 ** torch.arange(logits.shape[1])
+        expected = (weight * two_hot_loss(logits, imagined.returns)).mean()
+        pull = (weight * two_hot_loss(logits, imagined.value[:, :-1])).mean()
+    learner.update_behavior(start, torch.arange(6), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(losses["critic"], expected + scale * pull)
+
+
 @pytest.mark.parametrize("scale", [0.0, 0.3])
 def test_the_replay_value_loss_teaches_the_critic_alone(scale):
     updated = []

@@ -1,7 +1,8 @@
 """Losses of DreamerV3 (https://arxiv.org/abs/2301.04104) that the paper does not use.
 
 Each is behind a keyword of WPT that is off by default: `actor_grad="reinforce"`, `repval_scale`,
-and the continue head, which is used where the data hold a termination.
+`slow_critic_scale` (the critic's loss once more, with the target critic's values as targets), and
+the continue head, which is used where the data hold a termination.
 
 Our rewards come with arriving in a state: V_t contains r_t, which the action at step t did not
 cause. The return of that action is therefore γ V_{t+1}, and its baseline v_t - r_t.

@@ -176,6 +176,11 @@ class Hyperparameters(Keywords):
         "weight of DreamerV3's replay value loss, which trains the critic on returns that were "
         "earned; not in the paper. DreamerV3 has 0.3",
     )
+    slow_critic_scale: float = amount(
+        0.0,
+        "weight of DreamerV3's regulariser that pulls the critic to the target critic's values in "
+        "dreams; not in the paper. DreamerV3 has 1",
+    )
     recent_share: float = share(
         0.0,
         "share of a batch's online sequences that are drawn from the five newest episodes; not in "

@@ -172,7 +172,10 @@ class Learner(WorldModelLearner):
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
             value_loss = critic_loss(logits, returns, settings.gamma, goes_on)
-        total = value_loss if grounding is None else value_loss + grounding
+            total = value_loss if grounding is None else value_loss + grounding
+            if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
+                slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on)
+                total = total + settings.slow_critic_scale * slow
         critic_norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
         metrics = {

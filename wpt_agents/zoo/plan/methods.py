@@ -122,8 +122,9 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
 
 ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
 # DreamerV3 from scratch, by the settings of its code for images of DMControl. Left out are its
-# optimiser, norms and pooling, the spacing of its bins, the regulariser of its critic, and the
-# continue head, which makes no difference where no episode ends early.
+# optimiser, norms and pooling, the spacing of its bins, and the critic's regulariser on replayed
+# states. Its returns bootstrap from the critic, ours from the target critic. The continue head
+# makes no difference where no episode ends early.
 DREAMER_V3 = {
     **ALONE,
     "gamma": 0.997,
@@ -135,6 +136,7 @@ DREAMER_V3 = {
     "actor_outscale": 0.01,
     "actor_grad": "reinforce",
     "repval_scale": 0.3,
+    "slow_critic_scale": 1.0,
 }
 MODEL_FREE: dict[str, Any] = {"pretrained": False, "shared": (), "policy": "CnnPolicy"}
 METHODS = {

@@ -128,9 +128,9 @@ class Reference:
             with torch.no_grad():
                 target = state(self.f_bar, batch.next_image[:, h].float())
             cross = -(reward_two_hot(batch.reward[:, h]) * logits.log_softmax(1)).sum(1)
-            each = ((z - target) ** 2).mean(1) + 0.1 * cross
-            each = each + (0.1 if ends else 0.0) * (end - batch.end[:, h]) ** 2
-            loss = loss + (batch.inside[:, h] * each).mean()
+            wrong = ((z - target) ** 2).mean(1) + 0.1 * cross
+            wrong = wrong + (0.1 if ends else 0.0) * (end - batch.end[:, h]) ** 2
+            loss = loss + (batch.inside[:, h] * wrong).mean()
         self.adams[0].descend(loss)
 
     def update(self, batch, generator):

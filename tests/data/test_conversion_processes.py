@@ -50,6 +50,7 @@ def source(tmp_path):
     return tmp_path / "in"
 
 
+@pytest.mark.slow
 def test_of_several_processes_one_converts_and_the_others_wait(tmp_path, source):
     started = [opener(source, tmp_path / "cache", 0.2) for _ in range(3)]
     outputs = [process.communicate(timeout=300) for process in started]
@@ -60,6 +61,7 @@ def test_of_several_processes_one_converts_and_the_others_wait(tmp_path, source)
     assert sorted(out.count("reads") for out, _ in outputs) == [1, 1, 4]
 
 
+@pytest.mark.slow
 def test_a_killed_converter_holds_nobody_up_and_its_work_is_continued(tmp_path, source):
     killed = opener(source, tmp_path / "cache", 0.3)
     while "reads 1" not in killed.stdout.readline():

@@ -91,6 +91,7 @@ def test_other_folders_of_npz_files_are_not_taken_for_the_authors(tmp_path):
         open_episodes(tmp_path, "official")
 
 
+@pytest.mark.slow
 def test_an_import_that_was_killed_goes_on_where_it_stopped(tmp_path):
     for number in range(60):
         save(tmp_path / "dmcontrol" / "walker", number, chain(20, seed=number, size=64))

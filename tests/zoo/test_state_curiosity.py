@@ -58,6 +58,7 @@ def test_a_stage_acts_as_soft_actor_critic_does():
     np.testing.assert_allclose(drawn, np.quantile(expected, quantiles), atol=0.08)
 
 
+@pytest.mark.slow
 def test_five_stages_are_recorded_in_turn_and_depend_on_the_seed_alone(tmp_path):
     def recorded(name, workers):
         return collect(

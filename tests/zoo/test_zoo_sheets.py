@@ -50,6 +50,7 @@ def test_what_is_shown_is_of_every_kind_first(dataset):
     assert datasets.spread(only, 3) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_data_show_prints_the_table_and_draws_the_images(dataset, tmp_path, monkeypatch, capsys):
     assert call(monkeypatch, "data", "show", dataset.path, "--out", tmp_path / "sheet.png") == 0
     printed = capsys.readouterr().out

@@ -100,7 +100,8 @@ class Trajectory:
     def background(self) -> np.ndarray:
         """The median image, (H, W, 3) uint8, computed once, of 51 images evenly spaced."""
         times = np.linspace(0, len(self.image) - 1, min(GLANCES, len(self.image))).round()
-        return np.median(self.image[times.astype(int)], 0).astype(np.uint8)
+        median: np.ndarray = np.median(self.image[times.astype(int)], 0)
+        return median.astype(np.uint8)
 
     def __repr__(self) -> str:
         """A summary without the pixels."""

@@ -114,9 +114,9 @@ def joined(device: torch.device) -> Iterator[World]:
     gpu = device if device.type == "cuda" else None
     if gpu:
         torch.cuda.set_device(gpu)  # objects, too, are sent by way of it
-    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))  # type: ignore[attr-defined]
+    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
     backend = "nccl" if gpu else "gloo"
-    store = dist.PrefixStore(_meeting(), store)  # type: ignore[attr-defined]
+    store = dist.PrefixStore(_meeting(), store)
     dist.init_process_group(
         backend, store=store, rank=rank, world_size=size, timeout=PATIENCE, device_id=gpu
     )

@@ -39,7 +39,7 @@ def fail(one):
 
 def do_dot(one):
     """A real run, in a process that has never heard of the dot."""
-    from test_zoo import make_dot
+    from dot_runs import make_dot
 
     TASKS[one.task.id] = one.task
     gym.register(one.task.id, entry_point=make_dot)

@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import pytest
+from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecFrameStack, VecTransposeImage
-from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
-from test_zoo_resume import killed_at
+from test_resume import killed_at
 
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.zoo.plan import methods

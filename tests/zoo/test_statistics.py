@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from wpt_agents.zoo.report.aggregates import estimate
 from wpt_agents.zoo.statistics import (
     bootstrap,
     iqm,
     mean,
+    mean_interval,
     median,
     optimality_gap,
     performance_profile,
@@ -126,3 +128,14 @@ def test_the_profile_and_its_band_are_rliables():
     low, high = bootstrap(profile, list(RUNS.T))
     assert low == pytest.approx([0.7, 0.2, 0], abs=0.01)
     assert high == pytest.approx([1, 0.6, 0], abs=0.01)
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 31, 50])
+def test_the_interval_is_students(n):
+    values = np.random.default_rng(n).normal(5, 2, n)
+    expected = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
+    assert mean_interval(values.tolist())[1:] == pytest.approx(expected, abs=2e-3)
+
+
+def test_one_value_has_no_interval():
+    assert mean_interval([3.0]) == (3.0, None, None)

@@ -16,8 +16,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from debug_agent import same, weights
+from dot_runs import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 from stable_baselines3.common.logger import configure
-from test_zoo import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
@@ -258,12 +258,13 @@ def test_an_episode_depends_on_its_number_and_on_none_before_it():
 SCRIPT = """
 import sys; sys.path[:0] = {tests!r}
 from pathlib import Path
-import test_zoo, gymnasium
+import dot_runs, gymnasium
 from wpt_envs.tasks import TASKS
-from test_zoo_resume import CHANGES
-TASKS[test_zoo.DOT.id] = test_zoo.DOT
-gymnasium.register(test_zoo.DOT.id, entry_point=test_zoo.make_dot)
-test_zoo.run(test_zoo.job(Path({out!r}), **CHANGES))
+from test_resume import CHANGES
+from wpt_agents.zoo.run.runner import run
+TASKS[dot_runs.DOT.id] = dot_runs.DOT
+gymnasium.register(dot_runs.DOT.id, entry_point=dot_runs.make_dot)
+run(dot_runs.job(Path({out!r}), **CHANGES))
 """
 
 
@@ -271,7 +272,7 @@ def test_sigkill_at_random_moments_costs_nothing_that_was_kept(tmp_path):
     whole, broken = job(tmp_path / "whole", **CHANGES), job(tmp_path / "broken", **CHANGES)
     run(whole)
     here = Path(__file__).parent
-    folders = [str(here), str(here.parent / "helpers")]
+    folders = [str(here), str(here.parents[1] / "helpers")]
     script = SCRIPT.format(tests=folders, out=str(tmp_path / "broken"))
     rng, monitor = random.Random(0), broken.folder / "0.monitor.csv"
     for episodes in (1, 2, 4, None):  # after which it is killed, at some moment of the next one

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
+from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from engine_work import do_dot
-from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
@@ -23,24 +23,24 @@ LEARN = {"learn": {"frames": 75, "checkpoint_every": 25}}
 SCRIPT = """
 import sys; sys.path[:0] = {places!r}
 from pathlib import Path
-import gymnasium, test_zoo
+import dot_runs, gymnasium
 from engine_work import do_dot
 from test_interrupted_benchmark import LEARN, SEEDS
 from wpt_envs.tasks import TASKS
 from wpt_agents.zoo.run import engines
 engines.do = do_dot
 if __name__ == "__main__":
-    TASKS[test_zoo.DOT.id] = test_zoo.DOT
-    gymnasium.register(test_zoo.DOT.id, entry_point=test_zoo.make_dot)
-    jobs = [test_zoo.job(Path({out!r}), "scratch", seed, **LEARN) for seed in SEEDS]
+    TASKS[dot_runs.DOT.id] = dot_runs.DOT
+    gymnasium.register(dot_runs.DOT.id, entry_point=dot_runs.make_dot)
+    jobs = [dot_runs.job(Path({out!r}), "scratch", seed, **LEARN) for seed in SEEDS]
     sys.exit(not engines.run_on("local", jobs, False, engines.Resources(workers=4)))
 """
 
 
 def orchestrator(folder):
     """The process that does all runs, with a worker for each."""
-    tests = Path(__file__).parents[1]
-    places = [str(tests / "zoo"), str(tests / "helpers"), str(tests / "agents")]
+    tests = Path(__file__).parents[2]
+    places = [str(tests / "zoo" / "run"), str(tests / "helpers"), str(tests / "agents")]
     script = folder / "benchmark.py"
     script.write_text(SCRIPT.format(places=places, out=str(folder / "runs")))
     path = os.pathsep.join([*places, *filter(None, sys.path)])

@@ -5,8 +5,8 @@ from collections import namedtuple
 from dataclasses import replace
 
 import pytest
+from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from run_folders import make_run
-from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
 from wpt_agents.zoo.plan.estimate import check_space, disk_needed, gigabytes, hours_needed, summary

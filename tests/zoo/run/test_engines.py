@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
-from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
 from wpt_agents.zoo.result import read_result
@@ -24,7 +24,7 @@ from wpt_agents.zoo.terminal import console
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
 PLACES = os.pathsep.join(
-    [str(Path(__file__).parents[1] / "helpers"), *filter(None, sys.path)]
+    [str(Path(__file__).parents[2] / "helpers"), *filter(None, sys.path)]
 )  # for workers
 
 

@@ -2,111 +2,36 @@
 
 import csv
 import hashlib
-import io
-import json
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env
 import yaml
 from debug_agent import recorded
-from rich.console import Console
-from run_folders import make_run
-from scipy import stats
+from dot_runs import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-from typer.main import get_command
-from wpt_envs.tasks import TASKS, Task
-from zoo_command import call
+from wpt_envs.tasks import TASKS
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.learner import Learner
-from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
 from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.plan.presets import Preset
-from wpt_agents.zoo.plan.runs import Run, make_plan
+from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.report import record, tables
-from wpt_agents.zoo.report.folders import find_finished, read_results
-from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.report.folders import find_finished
+from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run import learning, runner, shared
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.shared import collect_data, pretrain
-from wpt_agents.zoo.statistics import mean_interval
-from wpt_agents.zoo.terminal import console
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
-
-DOT = Task("dmc", "dot", "dot", 2, toy_env.LENGTH, "return", False)
-MODEL_FREE = {
-    "channels": 2,
-    "feature_dim": 8,
-    "hidden_dim": 16,
-    "batch_size": 4,
-    "update_every": 5,
-    "learning_starts": 25,
-    "warmup_steps": 25,
-}
-SECTIONS = {
-    "env": {"action_repeat": 1, "rendering": "fast"},
-    "collect": {"tasks": ["dot"], "episodes": 4},
-    "pretrain": {"steps": 2},
-    "learn": {"frames": 75},
-    "evaluate": {"episodes": 3},
-    "wpt": {
-        "size": "debug",
-        "max_action_dim": 2,
-        "batch_size": 2,
-        "batch_length": 8,
-        "train_ratio": 2,
-        "learning_starts": 25,
-        "warmup_steps": 25,
-        "num_retrieve": 3,
-        "bc_steps": 2,
-        "bc_batch_size": 4,
-    },
-    "drqv2": MODEL_FREE | {"std": "linear(1,0.1,50)"},
-    "jsrl": {"bc_size": "debug", "bc_steps": 2, "bc_batch_size": 4, "warmup_steps": 0},
-    "r3m": {"clips": 4},
-    "rlpd": MODEL_FREE | {"critics": 2, "reward_members": 2, "num_retrieve": 3},
-    "mrq": {
-        "channels": 2,
-        "latent_dim": 8,
-        "hidden_dim": 8,
-        "batch_size": 4,
-        "horizon": 2,
-        "sync_every": 2,
-        "update_every": 10,
-        "learning_starts": 25,
-        "warmup_steps": 25,
-    },
-    "sac": {"buffer_size": 100, "learning_starts": 25, "batch_size": 4, "train_freq": 10},
-}
-
-
-def make_dot(action_repeat=1, rendering="fast", render_size=None, render_mode="rgb_array"):
-    return toy_env.DotEnv(render_mode)
-
-
-@pytest.fixture(autouse=True)
-def dot(monkeypatch):
-    monkeypatch.setitem(TASKS, DOT.id, DOT)
-    gym.register(DOT.id, entry_point=make_dot)
-    monkeypatch.setattr(console, "_width", 160)
-    yield
-    del gym.registry[DOT.id]
-
-
-def job(tmp_path, method="wpt", seed=0, data=None, **changes):
-    sections = {title: SECTIONS[title] | changes.get(title, {}) for title in SECTIONS}
-    return Run(DOT, seed, method, "toy", Preset.of(sections), tmp_path, 1, data=data)
 
 
 def test_a_run_leaves_everything_in_one_folder(tmp_path):
@@ -365,200 +290,6 @@ def test_evaluations_and_training_start_from_different_seeds(tmp_path):
     seeds = {job(tmp_path, seed=seed).evaluation_seed for seed in range(100)}
     assert len(seeds) == 100
     assert all(100 < seed < 2**31 - 100 for seed in seeds)
-
-
-@pytest.mark.parametrize("n", [2, 3, 10, 31, 50])
-def test_the_interval_is_students(n):
-    values = np.random.default_rng(n).normal(5, 2, n)
-    expected = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
-    assert mean_interval(values.tolist())[1:] == pytest.approx(expected, abs=2e-3)
-
-
-def test_one_value_has_no_interval():
-    assert mean_interval([3.0]) == (3.0, None, None)
-
-
-def fake_result(seed, mean, method="wpt", frames=150_000, untrained=()):
-    score = Score((mean - 10, mean + 10))
-    scores = {**dict.fromkeys(untrained, Score((-9.0, 11.0))), "last": score}
-    where = "dmc", "dmc-walker-run", method, Variant("paper"), seed, frames, frames // 2
-    return Result(*where, "return", scores, {}, "abc")
-
-
-def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
-    for seed, mean in enumerate((700.0, 710.0, 720.0)):
-        (tmp_path / str(seed)).mkdir()
-        write_result(tmp_path / str(seed), fake_result(seed, mean))
-    (row,) = tables.summarise(read_results(tmp_path))
-    # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
-    assert (row.seeds, row.mean, row.paper) == (3, 710, 728.0)
-    assert (row.low, row.high) == pytest.approx((685.2, 734.8), abs=0.1)
-
-
-def test_the_report_keeps_methods_and_budgets_apart():
-    other = fake_result(0, 1.0, frames=1)
-    rows = tables.summarise([fake_result(0, 1.0), fake_result(0, 2.0, "scratch"), other])
-    assert [(row.method, row.frames) for row in rows] == [
-        ("scratch", 150_000),
-        ("wpt", 1),
-        ("wpt", 150_000),
-    ]
-
-
-def test_the_report_prints_as_table_and_as_markdown(capsys):
-    rows = tables.summarise([fake_result(0, 1.234), fake_result(0, 456.7, "scratch")])
-    Console(width=200).print(tables.summary_table(rows))
-    printed = capsys.readouterr().out
-    for text in (printed, tables.markdown(rows)):
-        assert "1.23" in text
-        assert "457" in text
-    assert tables.markdown(rows).count("\n") == 4
-
-
-def test_every_policy_has_its_seeds_and_three_intervals():
-    results = [fake_result(seed, mean) for seed, mean in enumerate((700.0, 710.0, 720.0))]
-    (row,) = tables.policies(results)
-    assert (row.name, row.seeds, row.means, row.mean) == ("wpt", (0, 1, 2), (700, 710, 720), 710)
-    # six episodes, each 10 from its seed's mean: sd of the mean 10 / sqrt(6) = 4.1, extremes 700
-    assert 700 <= row.episodes_low < 705 and 715 < row.episodes_high <= 720
-    # all three draws the same seed: probability 1/27 > 2.5 %
-    assert (row.seeds_low, row.seeds_high) == (700, 720)
-    assert (row.t_low, row.t_high) == pytest.approx((685.2, 734.8), abs=0.1)
-    assert (row.episodes, row.commits, row.success) == (2, ("abc",), None)
-
-
-def test_untrained_policies_are_told_once_however_many_methods_met_them():
-    methods = ("wpt", "scratch")
-    results = [fake_result(0, 5.0, method, untrained=["nothing"]) for method in methods]
-    rows = tables.policies(results)
-    assert [(row.method, row.policy) for row in rows] == [
-        ("", "nothing"),
-        ("scratch", "last"),
-        ("wpt", "last"),
-    ]
-    assert rows[0].seeds_low is None  # one seed
-    table = tables.policy_markdown(rows)
-    assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in table
-    assert "| scratch | 5.0 |" in table
-    assert "Seeds 0, 2 episodes each; commit abc." in table
-
-
-def test_the_csv_reads_back_unrounded():
-    rows = tables.policies([fake_result(seed, 1 / 3 + seed) for seed in (0, 4)])
-    (read,) = csv.DictReader(io.StringIO(tables.policy_csv(rows)))
-    assert read["means"] == f"{rows[0].means[0]} {rows[0].means[1]}" and read["seeds"] == "0 4"
-    assert float(read["mean"]) == rows[0].mean
-    assert read["success"] == ""
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["run", "--preset", "demmo"], "Did you mean 'demo'"),
-        (["run", "--suite", "dcm"], "Did you mean 'dmc'"),
-        (["run", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
-        (["run", "--set", "gama=1"], "Did you mean 'gamma'"),
-        (["run", "--set", "learn.fames=1"], "Did you mean 'frames'"),
-        (["run", "--method", "scrath"], "Did you mean 'scratch'"),
-        (["run", "--seeds", "none"], "how many"),
-        (["run", "--tasks", "walker-run", "walker-rum"], "Did you mean 'walker-run'"),
-        (["run", "--data", "nowhere"], "nowhere does not exist"),
-        (["report", "nowhere"], "No finished run below nowhere"),
-        (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
-        (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),
-        (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
-        (["collect", "--out", "data", "--behaviour", "icn"], "Did you mean 'icm'"),
-        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gama=1"], "mean 'gamma'"),
-        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma must be a"),
-        (["run", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
-        (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
-        (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),
-        (["pretrain", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
-    ],
-)
-def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
-    words, message, monkeypatch, capsys, tmp_path
-):
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, *words) == 2
-    printed = capsys.readouterr()
-    assert message in printed.err
-    assert "Traceback" not in printed.err and printed.out == ""  # refused before anything is begun
-    assert list(tmp_path.iterdir()) == []
-
-
-COMMANDS = get_command(command_line.app).commands
-
-
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
-def test_every_command_has_help(command, monkeypatch, capsys):
-    assert call(monkeypatch, *command, "--help") == 0
-    assert "Usage" in capsys.readouterr().out
-
-
-def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
-    assert call(monkeypatch, "list", "--suite", "dmc") == 0
-    printed = capsys.readouterr().out
-    for word in ("dmc-quadruped-roll-fast", "demo", "no-rehearsal"):
-        assert word in printed
-    assert "metaworld-" not in printed
-
-
-def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_path):
-    words = ["--tasks", "walker-run", "cheetah-*", "--seeds", "2", "--out", tmp_path / "runs"]
-    assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
-    printed = capsys.readouterr().out
-    assert printed.count("dmc-cheetah-run-back ") == 2
-    assert "6 episodes to collect" in printed and " runs to do" in printed
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
-    words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
-    assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
-    printed = capsys.readouterr()
-    assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
-
-
-def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):
-    words = ["--tasks", "walker-run", "--preset", "debug", "--out", tmp_path]
-    folder = tmp_path / "debug" / "wpt" / "dmc-walker-run_0"
-    folder.mkdir(parents=True)
-    [one] = make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], [], tmp_path, 2, "auto")
-    (folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
-    assert call(monkeypatch, "run", *words, "--dry-run") == 0
-    assert call(monkeypatch, "run", *words, "--dry-run", "--set", "gamma=0.9") == 2
-    assert "other settings (wpt.gamma)" in capsys.readouterr().err
-
-
-def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
-    words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
-    assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0
-    printed = capsys.readouterr().out
-    assert "embodiment" in printed and "Dataset:" in printed and "{" not in printed
-
-
-def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
-    sections = [f"{t}.{k}={json.dumps(v)}" for t in SECTIONS for k, v in SECTIONS[t].items()]
-    words = ["run", "--preset", "debug", "--tasks", "dot", "--out", tmp_path, "--workers", "1"]
-    assert call(monkeypatch, *words, "--frames", "50", "--set", *sections) == 0
-    folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"
-    assert str(folder) in capsys.readouterr().out
-    assert json.loads((folder / "result.json").read_text())["frames"] == 50
-    assert call(monkeypatch, "report", tmp_path) == 0
-    assert "dmc-dot" in capsys.readouterr().out
-    assert call(monkeypatch, "report", tmp_path, "--markdown") == 0
-    printed = capsys.readouterr().out
-    assert all(f"| {name} |" in printed for name in ("doing nothing", "prior actor", "wpt"))
-    assert call(monkeypatch, "report", tmp_path, "--csv") == 0
-    assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")
-
-
-def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp_path):
-    make_run(tmp_path / "a", "dmc-dot")
-    make_run(tmp_path / "b", "dmc-dot")
-    with pytest.raises(ValueError, match="are the same run: report one of their folders"):
-        read_results(tmp_path)
 
 
 def test_runs_of_a_changed_preset_are_told_apart(tmp_path):

@@ -10,11 +10,11 @@ import pytest
 import torch
 import yaml
 from debug_agent import agent, noise
+from dot_runs import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from hub_stand_in import hub  # noqa: F401  (a fixture)
 from imageio_ffmpeg import count_frames_and_secs
 from PIL import Image
 from run_folders import make_run
-from test_zoo import DOT, SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
 from wpt_agents.data.trajectory import Trajectory

@@ -9,7 +9,7 @@ from zoo_command import call
 
 from wpt_agents.agents.wpt import WPT
 
-TINY = Path(__file__).parents[1] / "fixtures" / "official_tiny.pt"
+TINY = Path(__file__).parents[2] / "fixtures" / "official_tiny.pt"
 
 
 def test_a_file_of_the_authors_is_imported_and_exported(tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from wpt_agents.zoo import machine
 from wpt_agents.zoo.commands.app import app
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture

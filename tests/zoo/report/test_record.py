@@ -165,7 +165,7 @@ def test_three_suites_have_no_mean_of_both():
 
 
 def test_the_pages_rows_are_the_records():
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     table = record_tables.markdown(record.read(root / "zoo" / "results" / "small-benchmark.csv"))
     assert table == (root / "zoo" / "results" / "small-benchmark.md").read_text()
     page = (root / "docs" / "small-benchmark.md").read_text().splitlines()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_zoo_page import read, text
+from test_page import read, text
 from zoo_command import call
 
 from wpt_agents.zoo.report.figure4 import figures_4, find_sequences

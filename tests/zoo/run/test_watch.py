@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from rich.console import Console
 from stable_baselines3.common.results_plotter import load_results, plot_results, ts2xy
-from test_zoo import dot, job  # noqa: F401  (dot registers the task for each test)
 from zoo_command import call
 
 from wpt_agents.zoo.run.locks import locked

@@ -5,8 +5,8 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_zoo import DOT, SECTIONS, dot, job, make_dot  # noqa: F401
-from test_zoo_resume import KillAt, Killed
+from dot_runs import DOT, SECTIONS, dot, job, make_dot  # noqa: F401
+from test_resume import KillAt, Killed
 from wpt_envs.tasks import TASKS
 from zoo_command import call
 

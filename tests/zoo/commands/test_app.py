@@ -1,0 +1,117 @@
+"""The command line end to end: help, refusals, dry runs, and a whole benchmark of the toy task."""
+
+import json
+
+import pytest
+import yaml
+from dot_runs import SECTIONS, dot  # noqa: F401  (dot registers the task for each test)
+from typer.main import get_command
+from zoo_command import call
+
+from wpt_agents.zoo.commands import app as command_line
+from wpt_agents.zoo.plan.runs import make_plan
+
+pytestmark = pytest.mark.slow  # it runs simulators or whole runs
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "--preset", "demmo"], "Did you mean 'demo'"),
+        (["run", "--suite", "dcm"], "Did you mean 'dmc'"),
+        (["run", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+        (["run", "--set", "gama=1"], "Did you mean 'gamma'"),
+        (["run", "--set", "learn.fames=1"], "Did you mean 'frames'"),
+        (["run", "--method", "scrath"], "Did you mean 'scratch'"),
+        (["run", "--seeds", "none"], "how many"),
+        (["run", "--tasks", "walker-run", "walker-rum"], "Did you mean 'walker-run'"),
+        (["run", "--data", "nowhere"], "nowhere does not exist"),
+        (["report", "nowhere"], "No finished run below nowhere"),
+        (["list", "--suite", "dcm"], "Did you mean 'dmc'"),
+        (["pretrain", "--preset", "demmo"], "Did you mean 'demo'"),
+        (["collect", "--out", "data", "--tasks", "walker-rum"], "Did you mean 'walker-run'"),
+        (["collect", "--out", "data", "--behaviour", "icn"], "Did you mean 'icm'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gama=1"], "mean 'gamma'"),
+        (["collect", "--out", "data", "--behaviour", "icm", "--set", "gamma=2"], "gamma must be a"),
+        (["run", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
+        (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
+        (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),
+        (["pretrain", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
+    ],
+)
+def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(
+    words, message, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *words) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert "Traceback" not in printed.err and printed.out == ""  # refused before anything is begun
+    assert list(tmp_path.iterdir()) == []
+
+
+COMMANDS = get_command(command_line.app).commands
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+def test_every_command_has_help(command, monkeypatch, capsys):
+    assert call(monkeypatch, *command, "--help") == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
+    assert call(monkeypatch, "list", "--suite", "dmc") == 0
+    printed = capsys.readouterr().out
+    for word in ("dmc-quadruped-roll-fast", "demo", "no-rehearsal"):
+        assert word in printed
+    assert "metaworld-" not in printed
+
+
+def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "cheetah-*", "--seeds", "2", "--out", tmp_path / "runs"]
+    assert call(monkeypatch, "run", *words, "--preset", "debug", "--dry-run") == 0
+    printed = capsys.readouterr().out
+    assert printed.count("dmc-cheetah-run-back ") == 2
+    assert "6 episodes to collect" in printed and " runs to do" in printed
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
+    assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
+    printed = capsys.readouterr()
+    assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
+
+
+def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "walker-run", "--preset", "debug", "--out", tmp_path]
+    folder = tmp_path / "debug" / "wpt" / "dmc-walker-run_0"
+    folder.mkdir(parents=True)
+    [one] = make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], [], tmp_path, 2, "auto")
+    (folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
+    assert call(monkeypatch, "run", *words, "--dry-run") == 0
+    assert call(monkeypatch, "run", *words, "--dry-run", "--set", "gamma=0.9") == 2
+    assert "other settings (wpt.gamma)" in capsys.readouterr().err
+
+
+def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_path):
+    words = ["--tasks", "dot", "--episodes", "2", "--workers", "1", "--rendering", "fast"]
+    assert call(monkeypatch, "collect", "--out", tmp_path / "data", *words) == 0
+    printed = capsys.readouterr().out
+    assert "embodiment" in printed and "Dataset:" in printed and "{" not in printed
+
+
+def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
+    sections = [f"{t}.{k}={json.dumps(v)}" for t in SECTIONS for k, v in SECTIONS[t].items()]
+    words = ["run", "--preset", "debug", "--tasks", "dot", "--out", tmp_path, "--workers", "1"]
+    assert call(monkeypatch, *words, "--frames", "50", "--set", *sections) == 0
+    folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"
+    assert str(folder) in capsys.readouterr().out
+    assert json.loads((folder / "result.json").read_text())["frames"] == 50
+    assert call(monkeypatch, "report", tmp_path) == 0
+    assert "dmc-dot" in capsys.readouterr().out
+    assert call(monkeypatch, "report", tmp_path, "--markdown") == 0
+    printed = capsys.readouterr().out
+    assert all(f"| {name} |" in printed for name in ("doing nothing", "prior actor", "wpt"))
+    assert call(monkeypatch, "report", tmp_path, "--csv") == 0
+    assert capsys.readouterr().out.startswith("task,preset,frames,method,policy")

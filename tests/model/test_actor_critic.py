@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from chain import chain
+from debug_agent import same, weights
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.replay import mix
@@ -21,7 +22,7 @@ from wpt_agents.model.actor_critic import (
     lambda_return,
     return_range,
 )
-from wpt_agents.model.distributions import two_hot_loss
+from wpt_agents.model.distributions import two_hot_loss, two_hot_mean
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.model.policy import WPTPolicy
@@ -336,6 +337,50 @@ def test_the_default_decay_is_a_millionth():
         group = optimizer.param_groups[-1]
         assert group["lr"] * group["weight_decay"] == pytest.approx(1e-6)
         assert group["eps"] == 1e-5
+
+
+def test_reward_head_and_critic_have_the_bins_of_their_keyword(tmp_path):
+    models = {width: filled(bin_range=width, zero_init_heads=False) for width in (20.0, 7.0)}
+    feat = noise(3, DEBUG.deter + 64)
+    for width, model in models.items():
+        policy = model.policy
+        for logits, number in (
+            (policy.world_model.reward_head(feat), policy.world_model.reward(feat)),
+            (policy.critic(feat), policy.critic.value(feat)),
+            (policy.target_critic(feat), policy.target_critic.value(feat)),
+        ):
+            torch.testing.assert_close(number, two_hot_mean(logits, width))
+    assert same(*(weights(model) for model in models.values()))  # equal, and equally drawn
+    metrics = {width: defaultdict(list) for width in models}
+    for width, model in models.items():
+        model.update(metrics[width])
+    for name in ("train/reward_loss", "train/critic_loss"):
+        assert metrics[20.0][name] != metrics[7.0][name]
+    models[7.0].save(tmp_path / "model")
+    assert WPT.load(tmp_path / "model").policy.critic.bin_range == 7.0
+    with pytest.raises(ValueError, match=r"trained with bin_range=7\.0, now it is 20"):
+        WPT.load(tmp_path / "model", bin_range=20.0)
+    with pytest.raises(ValueError, match="bin_range must be a number above 0"):
+        agent(bin_range=0)
+
+
+@pytest.mark.parametrize("actor_grad", ["dynamics", "reinforce"])
+def test_the_entropys_weight_goes_by_its_schedule(actor_grad):
+    losses = {}
+    for ent_coef in ("linear(0.8,0.2,100)", 0.5):
+        model = filled(ent_coef=ent_coef, actor_grad=actor_grad)
+        model.num_timesteps = 50  # half way: .5
+        metrics = defaultdict(list)
+        model.update(metrics)
+        losses[ent_coef] = metrics["train/actor_loss"][0]
+        model.num_timesteps = 1000
+        model.update(metrics)
+        assert model.hyperparameters.ent_coef_at(model.learner.step) == (
+            0.5 if ent_coef == 0.5 else pytest.approx(0.2)
+        )
+    assert losses["linear(0.8,0.2,100)"] == losses[0.5]
+    with pytest.raises(ValueError, match=r"ent_coef='linear\(1\)' is not understood"):
+        agent(ent_coef="linear(1)")
 
 
 def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):

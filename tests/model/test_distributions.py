@@ -59,6 +59,19 @@ def test_two_hot_round_trip_over_a_million_either_way():
     torch.testing.assert_close(two_hot_mean(weights.log()), x, rtol=1e-4, atol=1e-5)
 
 
+def test_bins_over_another_range_by_hand():
+    # 5 bins over [-8, 8]: -8, -4, 0, 4, 8. symlog(e^3 - 1) = 3 lies 3/4 of the way from 0 to 4
+    x = torch.tensor([math.exp(3) - 1, 1e30])
+    weights = two_hot(x, 5, 8.0)
+    expected = torch.tensor([[0, 0, 0.25, 0.75, 0], [0, 0, 0, 0, 1.0]])
+    torch.testing.assert_close(weights, expected, atol=1e-6, rtol=0)
+    clipped = torch.tensor([math.exp(3) - 1, math.exp(8) - 1])
+    torch.testing.assert_close(two_hot_mean(weights.log(), 8.0), clipped)
+    # -(1/4 ln 1/5 + 3/4 ln 1/5) of even logits, whatever the range
+    even = torch.zeros(2, 5)
+    torch.testing.assert_close(two_hot_loss(even, x, 8.0), torch.full((2,), math.log(5)))
+
+
 def test_two_hot_mean_is_the_symexp_of_the_mean_bin():
     # Half on -20 + 130 * 40 / 254, half on -20 + 140 * 40 / 254: symexp of bin 135's place
     logits = torch.full((BINS,), -1e9)

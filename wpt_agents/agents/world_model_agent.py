@@ -22,6 +22,7 @@ from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.data.units import compare_units
 from wpt_agents.fast.compiled import compile_loops
+from wpt_agents.model.distributions import BIN_RANGE
 from wpt_agents.model.observations import State
 from wpt_agents.model.ops import definitions
 from wpt_agents.model.policy import WPTPolicy
@@ -64,6 +65,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             settings.unimix,
             settings.value("zero_init_heads"),
             settings.actor_outscale,
+            settings.bin_range,
         ).to(self.device)
         if settings.compile:
             compile_loops(policy)
@@ -106,6 +108,19 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         if any(name.startswith("world_model.continue_head.") for name in weights):
             model.make_continue_head(0.0, 0)
         self.learner.add_continue_head()
+
+    def restore(
+        self,
+        header: Mapping[str, Any],
+        tensors: Mapping[str, Mapping[str, Tensor]],
+        same: tuple[str, ...],
+    ) -> None:
+        """Take over a model file. Heads that have learned need the bins that they learned with."""
+        if header["counters"].get("updates"):
+            same = (*same, "bin_range")
+            keywords = {"bin_range": BIN_RANGE} | header["hyperparameters"]  # not in older files
+            header = {**header, "hyperparameters": keywords}
+        super().restore(header, tensors, same)
 
     def operations(self) -> AbstractContextManager[None]:
         """Return the context that the networks compute in, by the keyword `fast`."""

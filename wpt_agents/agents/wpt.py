@@ -273,6 +273,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
+        self.learner.step = progress.num_timesteps
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
             update = self.learner.update(batch, generator, imitation, head_start)

@@ -3,7 +3,13 @@
 import torch
 from torch import Generator, Tensor, nn
 
-from wpt_agents.model.distributions import BINS, TruncatedNormal, two_hot_loss, two_hot_mean
+from wpt_agents.model.distributions import (
+    BIN_RANGE,
+    BINS,
+    TruncatedNormal,
+    two_hot_loss,
+    two_hot_mean,
+)
 from wpt_agents.model.layers import Head
 from wpt_agents.model.sizes import Size
 
@@ -64,18 +70,23 @@ def draw_starts(
 
 
 def critic_loss(
-    logits: Tensor, lambda_return: Tensor, gamma: float = 0.99, goes_on: Tensor | None = None
+    logits: Tensor,
+    lambda_return: Tensor,
+    gamma: float = 0.99,
+    goes_on: Tensor | None = None,
+    bin_range: float = BIN_RANGE,
 ) -> Tensor:
     """Eq. (3): -ln v(V_t | s_t), averaged, step t weighing γ^t.
 
     :param logits: (B, H, bins), of detached states
     :param lambda_return: (B, H); no gradient reaches it
     :param goes_on: (B, H), c of `lambda_return`: steps that dreams hardly reach weigh less
+    :param bin_range: of the bins, in symlog space
     """
     assert logits.shape[:2] == lambda_return.shape, (logits.shape, lambda_return.shape)
     weight = discounts(lambda_return.shape[1], gamma, like=lambda_return)
     weight = weight if goes_on is None else weight * survival(goes_on)
-    return (weight * two_hot_loss(logits, lambda_return.detach())).mean()
+    return (weight * two_hot_loss(logits, lambda_return.detach(), bin_range)).mean()
 
 
 def actor_loss(
@@ -188,11 +199,15 @@ class Actor(Head):
 
 
 class Critic(Head):
-    """v(V | s): a distribution over returns, two-hot in symlog space."""
+    """v(V | s): a distribution over returns, two-hot in symlog space.
 
-    def __init__(self, size: Size, zero_init: bool = False) -> None:
+    :param bin_range: of the bins, in symlog space
+    """
+
+    def __init__(self, size: Size, zero_init: bool = False, bin_range: float = BIN_RANGE) -> None:
         super().__init__(size, 3, BINS, zero_init)  # 3 layers: Table 2
+        self.bin_range = bin_range
 
     def value(self, feat: Tensor) -> Tensor:
         """Return the mean return: (..., D + S*K) -> (...)."""
-        return two_hot_mean(self(feat))
+        return two_hot_mean(self(feat), self.bin_range)

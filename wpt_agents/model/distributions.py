@@ -6,7 +6,8 @@ from collections.abc import Iterable
 import torch
 from torch import Generator, Tensor
 
-BINS = 255  # of the two-hot heads, evenly spaced over [-20, 20] in symlog space, as in DreamerV3
+BINS = 255  # of the two-hot heads
+BIN_RANGE = 20.0  # the bins are evenly spaced over [-20, 20] in symlog space, as in DreamerV3
 SQRT2 = math.sqrt(2.0)
 
 
@@ -69,13 +70,14 @@ def symexp(x: Tensor) -> Tensor:
     return torch.where(x < 0, -torch.expm1(-x), torch.expm1(x))  # unlike with sign, of slope 1 at 0
 
 
-def two_hot(x: Tensor, bins: int = BINS) -> Tensor:
+def two_hot(x: Tensor, bins: int = BINS, bin_range: float = BIN_RANGE) -> Tensor:
     """Express symlog(x) as weights on the two nearest bins.
 
-    :param x: (...), any real number; it is clipped at symexp(20)
+    :param x: (...), any real number; it is clipped at symexp(bin_range)
+    :param bin_range: the bins are evenly spaced over [-bin_range, bin_range]
     :return: (..., bins), of which at most two are not zero and the sum is 1
     """
-    position = (symlog(x).clamp(-20, 20) + 20) * (bins - 1) / 40
+    position = (symlog(x).clamp(-bin_range, bin_range) + bin_range) * (bins - 1) / (2 * bin_range)
     below = position.floor().clamp(max=bins - 2)
     upper = (position - below).unsqueeze(-1)
     index = below.long().unsqueeze(-1)
@@ -83,15 +85,15 @@ def two_hot(x: Tensor, bins: int = BINS) -> Tensor:
     return weights.scatter_(-1, index, 1 - upper).scatter_(-1, index + 1, upper)
 
 
-def two_hot_mean(logits: Tensor) -> Tensor:
+def two_hot_mean(logits: Tensor, bin_range: float = BIN_RANGE) -> Tensor:
     """Symexp of the mean bin: (..., bins) logits -> (...)."""
     logits = logits.float()
-    bins = torch.linspace(-20, 20, logits.shape[-1], device=logits.device)
+    bins = torch.linspace(-bin_range, bin_range, logits.shape[-1], device=logits.device)
     # As in DreamerV3's first version; the later one averages symexp-spaced bins instead.
     return symexp((logits.softmax(-1) * bins).sum(-1))  # a matmul would fall to bfloat16
 
 
-def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
+def two_hot_loss(logits: Tensor, target: Tensor, bin_range: float = BIN_RANGE) -> Tensor:
     """-ln p(target): cross entropy with the two-hot target.
 
     :param logits: (..., bins)
@@ -99,7 +101,7 @@ def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
     :return: (...)
     """
     logits = logits.float()
-    return -(two_hot(target, logits.shape[-1]) * logits.log_softmax(-1)).sum(-1)
+    return -(two_hot(target, logits.shape[-1], bin_range) * logits.log_softmax(-1)).sum(-1)
 
 
 def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from wpt_agents.model.distributions import two_hot_loss
+from wpt_agents.model.distributions import BIN_RANGE, two_hot_loss
 
 
 def advantage(
@@ -79,7 +79,9 @@ def replay_return(
     return torch.stack(returns[::-1], 1)
 
 
-def replay_value_loss(logits: Tensor, replay_return: Tensor, known: Tensor) -> Tensor:
+def replay_value_loss(
+    logits: Tensor, replay_return: Tensor, known: Tensor, bin_range: float = BIN_RANGE
+) -> Tensor:
     """DreamerV3's replay value loss: -ln v(V_t | s_t) where the rewards are known.
 
     It holds the critic to returns that were earned, where dreams may promise too much.
@@ -87,8 +89,9 @@ def replay_value_loss(logits: Tensor, replay_return: Tensor, known: Tensor) -> T
     :param logits: (B, T, bins) of the critic on detached replayed states
     :param replay_return: (B, T); no gradient reaches it
     :param known: (B, T) bool
+    :param bin_range: of the bins, in symlog space
     """
-    loss = two_hot_loss(logits, replay_return.detach())
+    loss = two_hot_loss(logits, replay_return.detach(), bin_range)
     return (loss * known).sum() / known.sum().clamp_min(1)
 
 

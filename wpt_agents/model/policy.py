@@ -15,7 +15,7 @@ from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import PriorActor
-from wpt_agents.model.distributions import Noise
+from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
     Observation,
@@ -49,6 +49,7 @@ class WPTPolicy(BasePolicy):
     :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
+    :param bin_range: largest value of reward head and critic, in symlog space
     """
 
     action_space: spaces.Box
@@ -69,6 +70,7 @@ class WPTPolicy(BasePolicy):
         unimix: float = 0.01,
         zero_init_heads: bool = False,
         actor_outscale: float = 1.0,
+        bin_range: float = BIN_RANGE,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.updates = 0
@@ -77,7 +79,8 @@ class WPTPolicy(BasePolicy):
         self.unimix = unimix
         self.zero_init_heads = zero_init_heads
         self.actor_outscale = actor_outscale
-        self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads)
+        self.bin_range = bin_range
+        self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads, bin_range)
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
@@ -90,8 +93,8 @@ class WPTPolicy(BasePolicy):
         self.world_model.reset_reward_head()
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
-        self.critic = Critic(size, self.zero_init_heads).to(device)
-        self.target_critic = Critic(size).to(device).requires_grad_(False)
+        self.critic = Critic(size, self.zero_init_heads, self.bin_range).to(device)
+        self.target_critic = Critic(size, False, self.bin_range).to(device).requires_grad_(False)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.average_actor = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
@@ -266,6 +269,7 @@ class WPTPolicy(BasePolicy):
             "unimix": self.unimix,
             "zero_init_heads": self.zero_init_heads,
             "actor_outscale": self.actor_outscale,
+            "bin_range": self.bin_range,
         }
 
 

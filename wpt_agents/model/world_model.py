@@ -8,7 +8,14 @@ from torch import Tensor, nn
 
 from wpt_agents.data.trajectory import Batch, MarkedBatch
 from wpt_agents.files.names import unknown_name
-from wpt_agents.model.distributions import BINS, Noise, kl_one_hot, two_hot_loss, two_hot_mean
+from wpt_agents.model.distributions import (
+    BIN_RANGE,
+    BINS,
+    Noise,
+    kl_one_hot,
+    two_hot_loss,
+    two_hot_mean,
+)
 from wpt_agents.model.images import Decoder, Encoder, to_uint8, to_unit
 from wpt_agents.model.layers import Head
 from wpt_agents.model.ops import op
@@ -99,16 +106,19 @@ def world_model_loss(
     return WorldModelLoss(error + dyn_scale * dyn + rep_scale * rep, error, kl)
 
 
-def reward_loss(logits: Tensor, reward: Tensor, known: Tensor) -> Tensor:
+def reward_loss(
+    logits: Tensor, reward: Tensor, known: Tensor, bin_range: float = BIN_RANGE
+) -> Tensor:
     """-ln p_xi(r_t | s_t), averaged over the steps whose reward is known (A.3, Algorithm 1).
 
     :param logits: (B, T, bins), the reward head's output on detached features
     :param reward: (B, T)
     :param known: (B, T) bool
+    :param bin_range: of the bins, in symlog space
     """
     assert logits.shape[:-1] == reward.shape == known.shape, (logits.shape, known.shape)
     # a batch of retrieved rows alone has no known reward: its loss is 0, not NaN
-    return (two_hot_loss(logits, reward) * known).sum() / known.sum().clamp_min(1)
+    return (two_hot_loss(logits, reward, bin_range) * known).sum() / known.sum().clamp_min(1)
 
 
 class WorldModel(nn.Module):
@@ -120,10 +130,16 @@ class WorldModel(nn.Module):
     :param action_dim: the padded action width
     :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start the reward head at zero, as DreamerV3 does
+    :param bin_range: of the reward head's bins, in symlog space
     """
 
     def __init__(
-        self, size: Size, action_dim: int, unimix: float = 0.01, zero_init_heads: bool = False
+        self,
+        size: Size,
+        action_dim: int,
+        unimix: float = 0.01,
+        zero_init_heads: bool = False,
+        bin_range: float = BIN_RANGE,
     ) -> None:
         super().__init__()
         self.encoder = Encoder(size.depth)
@@ -131,6 +147,7 @@ class WorldModel(nn.Module):
         self.decoder = Decoder(size)
         self.size = size
         self.zero_init_heads = zero_init_heads
+        self.bin_range = bin_range
         self.reset_reward_head()
 
     def reset_reward_head(self) -> None:
@@ -193,7 +210,7 @@ class WorldModel(nn.Module):
 
     def reward(self, feat: Tensor) -> Tensor:
         """Predict the reward for arriving in a state: (..., D + S*K) -> (...)."""
-        return two_hot_mean(self.reward_head(feat))
+        return two_hot_mean(self.reward_head(feat), self.bin_range)
 
     def goes_on(self, feat: Tensor) -> Tensor:
         """Predict the probability that the episode goes on after a state: (..., D + S*K) -> (...).

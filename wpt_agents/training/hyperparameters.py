@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from wpt_agents.model.behavior_cloning import FRAMES
+from wpt_agents.model.distributions import BIN_RANGE
 from wpt_agents.model.sizes import Size, find_size, plain_size
 from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.training.keywords import (
@@ -19,7 +20,9 @@ from wpt_agents.training.keywords import (
     amount,
     choice,
     count,
+    is_number,
     keyword,
+    must,
     schedule,
     share,
     switch,
@@ -63,6 +66,13 @@ class Hyperparameters(Keywords):
     )
     actor_outscale: float = amount(
         1.0, "factor on the initial weights of the actor's last layer", Stage.SIZE
+    )
+    bin_range: float = keyword(
+        BIN_RANGE,
+        must("a number above 0", lambda value: is_number(value) and value > 0),
+        "the 255 bins of reward head and critic reach from minus to plus this, in symlog space: 20 "
+        "is a return of 485 million, 7 one of 1,096. What lies beyond is clipped",
+        Stage.SIZE,
     )
     data_dependent_init: bool = switch(
         True,
@@ -131,7 +141,12 @@ class Hyperparameters(Keywords):
     )
     gamma: float = share(0.99, "discount factor")
     lam: float = share(0.95, "λ of Eq. (2)")
-    ent_coef: float = amount(1e-4, "η of Eq. (4), the weight of the entropy")
+    ent_coef: str | float = schedule(
+        1e-4,
+        np.inf,
+        "η of Eq. (4), the weight of the entropy: a number, or a schedule such as "
+        "'linear(3e-3,3e-4,20000)', with which the policy commits later than by its end value",
+    )
     imagine_horizon: int = count(  # the value of the first state is no action's
         16, "H, imagined steps", least=2
     )
@@ -279,6 +294,10 @@ class Hyperparameters(Keywords):
     def guidance_at(self, step: int) -> float:
         """Return the probability that an episode that begins at this step is guided."""
         return parse_schedule(self.guidance)(step)
+
+    def ent_coef_at(self, step: int) -> float:
+        """Return the weight of the entropy at this step."""
+        return parse_schedule(self.ent_coef, np.inf, "ent_coef")(step)
 
     def kickstart_at(self, step: int) -> float:
         """Return the weight of the imitation loss at this step."""

@@ -57,6 +57,7 @@ class Learner(WorldModelLearner):
         rate = self.hyperparameters.value("actor_critic_learning_rate")
         self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
         self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
+        self.step = 0  # collected steps, by which schedules go
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
@@ -127,7 +128,9 @@ class Learner(WorldModelLearner):
             returns = replay_return(
                 batch.reward, value, is_last, batch.is_terminal, settings.gamma, settings.lam
             )
-            return replay_value_loss(self.policy.critic(post.feat), returns, batch.reward_known)
+            logits = self.policy.critic(post.feat)
+            bin_range = self.policy.bin_range
+            return replay_value_loss(logits, returns, batch.reward_known, bin_range)
 
     def draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
         """Return the numbers of the batch's states to imagine from, (N,)."""
@@ -171,10 +174,11 @@ class Learner(WorldModelLearner):
         policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
-            value_loss = critic_loss(logits, returns, settings.gamma, goes_on)
+            bins = policy.bin_range
+            value_loss = critic_loss(logits, returns, settings.gamma, goes_on, bins)
             total = value_loss if grounding is None else value_loss + grounding
             if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
-                slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on)
+                slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on, bins)
                 total = total + settings.slow_critic_scale * slow
         critic_norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
@@ -209,8 +213,9 @@ class Learner(WorldModelLearner):
         settings = self.hyperparameters
         dream, reward, value, returns, goes_on = imagined
         gamma = settings.gamma
+        ent_coef = settings.ent_coef_at(self.step)
         if settings.actor_grad == "dynamics":
-            return actor_loss(returns, dream.entropy, settings.ent_coef, gamma, scale, goes_on)
+            return actor_loss(returns, dream.entropy, ent_coef, gamma, scale, goes_on)
         feat = dream.states.but_last().but_last().feat.detach()
         dist = self.policy.actor.dist(feat, self.policy.action_mask)
         return reinforce_loss(
@@ -218,7 +223,7 @@ class Learner(WorldModelLearner):
             advantage(reward, value, returns, gamma if goes_on is None else gamma * goes_on),
             dist.entropy(),
             actor_weight(gamma, returns, goes_on),
-            settings.ent_coef,
+            ent_coef,
             scale,
         )
 

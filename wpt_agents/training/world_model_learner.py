@@ -76,7 +76,7 @@ class WorldModelLearner:
             total = loss.total
             if learn_reward:
                 logits = model.reward_head(post.feat.detach())
-                reward = reward_loss(logits, batch.reward, batch.reward_known)
+                reward = reward_loss(logits, batch.reward, batch.reward_known, model.bin_range)
                 total = total + reward
                 metrics["train/reward_loss"] = reward.detach()
         norm = self.descend(self.model_optimizer, total, "world model")

@@ -121,6 +121,11 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             keywords = {"bin_range": BIN_RANGE} | header["hyperparameters"]  # not in older files
             header = {**header, "hyperparameters": keywords}
         super().restore(header, tensors, same)
+        self.let_clone_compete()
+
+    def let_clone_compete(self) -> None:
+        """Let the policy choose between actor and clone (`ibrl`) if there is a clone."""
+        self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
 
     def operations(self) -> AbstractContextManager[None]:
         """Return the context that the networks compute in, by the keyword `fast`."""
@@ -178,12 +183,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         self.progress.reset("cloned", "task_updates")
         super().reset_task()
+        self.let_clone_compete()
 
     def hyperparameters_changed(self) -> None:
         """Let the learner use the changed keywords, if they suit the dataset."""
         if self.dataset is not None:
             self.check_data(self.dataset)
         self.learner.configure(self.hyperparameters)
+        self.let_clone_compete()
 
     # What a model can show
 

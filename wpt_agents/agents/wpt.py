@@ -230,6 +230,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         )
         self.policy.prior_actor.load_state_dict(actor.state_dict())
         self.progress.cloned = True
+        self.let_clone_compete()
 
     # // Collect Data: see `PixelAgent.collect`, which asks these
 

@@ -14,14 +14,17 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
-from wpt_agents.model.behavior_cloning import PriorActor
+from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
+from wpt_agents.model.choosing import actor_or_clone
 from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
+    IMAGE_SPACE,
     Observation,
     State,
     check_episode_start,
     check_state,
+    stack_frames,
     to_images,
 )
 from wpt_agents.model.ops import op
@@ -56,6 +59,7 @@ class WPTPolicy(BasePolicy):
     average_actor: (
         Actor | None
     )  # a running average of `actor`, which acts in its place; not learned
+    ibrl: bool = False  # whether the prior actor's action is taken where it is worth more
     image_key: str | None = None  # the entry to see of Dict observations; their only image if None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
@@ -139,9 +143,14 @@ class WPTPolicy(BasePolicy):
         self.updates += 1
 
     def initial_state(self, n: int) -> State:
-        """Return the acting state of n new episodes: h (n, D), z (n, S, K), last action (n, A)."""
+        """Return the acting state of n new episodes: h (n, D), z (n, S, K), last action (n, A).
+
+        With `ibrl`, the last three images (n, F, 64, 64, 3) come before the action.
+        """
         shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
-        return tuple(np.zeros(s, np.float32) for s in (*shapes, (n, self.max_action_dim)))
+        frames = [np.zeros((n, FRAMES, *IMAGE_SPACE.shape), np.uint8)] if self.ibrl else []
+        latent = [np.zeros(shape, np.float32) for shape in shapes]
+        return (*latent, *frames, np.zeros((n, self.max_action_dim), np.float32))
 
     @torch.inference_mode()
     def act(
@@ -164,17 +173,30 @@ class WPTPolicy(BasePolicy):
         n = len(image)
         fresh = self.initial_state(n)
         if state is not None:
+            state = self._with_frames(state, image)
             check_state(state, tuple(part.shape[1:] for part in fresh), n)
-        *latent, action = (self._tensor(x) for x in state or fresh)
+        deter, stoch, *_, before = (self._tensor(x) for x in state or fresh)
         first = check_episode_start(episode_start, n)
-        inputs = self._tensor(image), Latent(*latent), action, self._tensor(first)
+        inputs = self._tensor(image), Latent(deter, stoch), before, self._tensor(first)
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.acting_actor.truncated(outputs, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
-        state = tuple(x.cpu().numpy() for x in (*post, action))
+        seen: list[np.ndarray] = []
+        if self.ibrl:
+            seen = [stack_frames(image, state[2] if state else None, first)]
+            action = actor_or_clone(self, post, action, self._tensor(seen[0]))
+        latent = [x.cpu().numpy() for x in post]
+        state = (*latent, *seen, action.cpu().numpy())
         if not np.isfinite(state[-1]).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
         return state[-1], state
+
+    def _with_frames(self, state: State, image: np.ndarray) -> State:
+        """Add or remove the images of a state, so that `ibrl` can change within an episode."""
+        parts = len(state) if isinstance(state, tuple | list) else 0
+        if self.ibrl and parts == 3:
+            return (*state[:2], stack_frames(image, None, None), state[2])
+        return (*state[:2], state[3]) if parts == 4 and not self.ibrl else state
 
     def executed(self, state: State, action: np.ndarray) -> State:
         """Return the acting state after `action` (n, A) was executed instead of the policy's."""

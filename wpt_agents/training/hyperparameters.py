@@ -227,6 +227,13 @@ class Hyperparameters(Keywords):
         "schedule of the probability that an episode is guided; 0: no guidance",
         Stage.ACTING,
     )
+    ibrl: bool = switch(
+        False,
+        "at each step that is not guided, also in `predict`, take the prior actor's action instead "
+        "of the actor's where the critic expects more of the state it leads to (IBRL); not in the "
+        "paper",
+        Stage.ACTING,
+    )
     episode_length: int | None = count(
         None,
         "steps of an episode, for the guidance window; that of the longest episode if None",
@@ -289,7 +296,7 @@ class Hyperparameters(Keywords):
     @property
     def needs_clone(self) -> bool:
         """Whether the prior actor will ever act or be imitated."""
-        return self.imitates or ever(parse_schedule(self.guidance))
+        return self.imitates or self.ibrl or ever(parse_schedule(self.guidance))
 
     def guidance_at(self, step: int) -> float:
         """Return the probability that an episode that begins at this step is guided."""

@@ -1,0 +1,66 @@
+"""Which of two actions to take: the actor's or the clone's, by the value of where they lead.
+
+The choice is that of imitation-bootstrapped RL (IBRL, https://arxiv.org/abs/2311.02198). IBRL asks
+a Q-function; here the world model imagines the step. Values include the reward on arriving (Eq. 2),
+so an action is worth γ v(s') of the state s' it leads to, and γ is the same for both.
+"""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from wpt_agents.model.actor_critic import Critic
+from wpt_agents.model.behavior_cloning import PriorActor
+from wpt_agents.model.rssm import RSSM, Latent
+from wpt_agents.model.world_model import WorldModel
+
+
+class Chooser(Protocol):
+    """A policy with all that takes part in the choice."""
+
+    world_model: WorldModel
+    target_critic: Critic
+    prior_actor: PriorActor
+    action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
+
+
+def choose_by_value(
+    action: Tensor, proposal: Tensor, value: Tensor, proposed_value: Tensor
+) -> Tensor:
+    """Take `proposal` where it is worth more than `action`.
+
+    :param action: (N, A)
+    :param proposal: (N, A)
+    :param value: (N,), of `action`
+    :param proposed_value: (N,), of `proposal`
+    """
+    assert action.shape == proposal.shape, (action.shape, proposal.shape)
+    assert value.shape == proposed_value.shape == action.shape[:1], (value.shape, action.shape)
+    return torch.where((proposed_value > value)[:, None], proposal, action)
+
+
+def value_of_action(rssm: RSSM, critic: Critic, state: Latent, action: Tensor) -> Tensor:
+    """Return v(s') of the most likely state s' that an action leads to.
+
+    No random number is drawn, so that acting is as reproducible as without the choice.
+
+    :param state: (N, ...)
+    :param action: (N, A)
+    :return: (N,)
+    """
+    states, _ = rssm.imagine(state, lambda _, __: action, 1, sample=False)
+    return critic.value(states.feat[:, 1])
+
+
+def actor_or_clone(policy: Chooser, state: Latent, action: Tensor, frames: Tensor) -> Tensor:
+    """Return the actor's action, or the clone's where the target critic expects more of it.
+
+    :param state: (N, ...), where to act
+    :param action: (N, A), the actor's
+    :param frames: (N, F, 64, 64, 3) uint8, what the clone sees
+    """
+    proposal = policy.prior_actor.act(frames, policy.action_mask)
+    rssm = policy.world_model.rssm
+    values = (value_of_action(rssm, policy.target_critic, state, a) for a in (action, proposal))
+    return choose_by_value(action, proposal, *values)

@@ -99,8 +99,20 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             model.make_continue_head(math.log(odds), seed)
             self.learner.add_continue_head()
 
+    def fit_reward_ensemble(self) -> None:
+        """Have as many reward heads as the keyword says; new ones know nothing yet."""
+        model = self.policy.world_model
+        number = self.hyperparameters.reward_ensemble - 1
+        if len(model.reward_members) != number:
+            model.make_reward_members(self.member_seeds(number))
+            self.learner.add_reward_members()
+
+    def member_seeds(self, number: int) -> list[int]:
+        """Return the seeds of the further reward heads."""
+        return [self.streams.integer(Purpose.ENSEMBLE, k) for k in range(number)]
+
     def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
-        """Add or remove the continue head, which only models of tasks that end have."""
+        """Have the continue head and the further reward heads that these weights are of."""
         if not weights:
             return
         model = self.policy.world_model
@@ -108,6 +120,10 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         if any(name.startswith("world_model.continue_head.") for name in weights):
             model.make_continue_head(0.0, 0)
         self.learner.add_continue_head()
+        start = "world_model.reward_members."
+        members = {name.split(".")[2] for name in weights if name.startswith(start)}
+        model.make_reward_members(self.member_seeds(len(members)))
+        self.learner.add_reward_members()
 
     def restore(
         self,

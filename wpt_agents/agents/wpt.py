@@ -256,6 +256,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         progress = self.progress
         self.adapt_to_data(self.replay_buffer)
         self.learn_ends()
+        self.fit_reward_ensemble()
         batch = mix(
             self.replay_buffer,
             self.retrieved,

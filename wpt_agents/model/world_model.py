@@ -1,5 +1,6 @@
 """The world model and its losses: Eq. (1) world_model_loss, and reward_loss of A.3."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -121,10 +122,25 @@ def reward_loss(
     return (two_hot_loss(logits, reward, bin_range) * known).sum() / known.sum().clamp_min(1)
 
 
+def pessimistic_reward(rewards: Tensor, pessimism: float) -> Tensor:
+    """Return μ - β σ of an ensemble's predictions: less where its members disagree.
+
+    :param rewards: (..., members)
+    :param pessimism: β; 0 for the mean
+    :return: (...)
+    """
+    mean = rewards.mean(-1)
+    if not pessimism:
+        return mean
+    variance = rewards.var(-1, correction=0)
+    return mean - pessimism * (variance + 1e-12).sqrt()  # whose slope at 0 would be infinite
+
+
 class WorldModel(nn.Module):
     """Encoder, RSSM, decoder, and the heads of a task, which only fine-tuning trains.
 
-    `continue_head` is None unless episodes of the task can end.
+    `continue_head` is None unless episodes of the task can end; `reward_members` are further heads
+    like the reward head, of which there are none in the paper.
 
     :param size: the widths
     :param action_dim: the padded action width
@@ -154,19 +170,35 @@ class WorldModel(nn.Module):
         """Draw new weights for what belongs to a task: rewards do, and where episodes end."""
         # Two layers, as in the authors' code; Table 2 says three for all heads.
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
+        self.reward_members = nn.ModuleList()
         self.continue_head: Head | None = None
+
+    @property
+    def heads(self) -> list[nn.Module]:
+        """All heads, which belong to a task."""
+        last = [] if self.continue_head is None else [self.continue_head]
+        return [self.reward_head, *self.reward_members, *last]
+
+    def make_reward_members(self, seeds: Sequence[int]) -> None:
+        """Replace the further reward heads by new ones, each drawn with a seed of its own."""
+        heads = [self._own_head(BINS, self.zero_init_heads, seed) for seed in seeds]
+        self.reward_members = nn.ModuleList(heads)
 
     def make_continue_head(self, log_odds: float, seed: int) -> None:
         """Add DreamerV3's continue head, which predicts whether the episode goes on after a state.
 
         :param log_odds: of going on, before anything is learned
-        :param seed: of its own random numbers, so that no other network changes
+        :param seed: of its random numbers
         """
+        self.continue_head = self._own_head(1, True, seed)
+        nn.init.constant_(self.continue_head.layers[-1].get_parameter("bias"), log_odds)
+
+    def _own_head(self, outputs: int, zero_init: bool, seed: int) -> Head:
+        """Make a head from random numbers of its own, so that no other network changes."""
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            head = Head(self.size, 2, 1, zero_init=True)
-        nn.init.constant_(head.layers[-1].get_parameter("bias"), log_odds)
-        self.continue_head = head.to(self.rssm.post_in.weight.device)
+            head = Head(self.size, 2, outputs, zero_init)
+        return head.to(self.rssm.post_in.weight.device)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
         """Return theta: the parameters of everything but the reward head."""
@@ -210,7 +242,14 @@ class WorldModel(nn.Module):
 
     def reward(self, feat: Tensor) -> Tensor:
         """Predict the reward for arriving in a state: (..., D + S*K) -> (...)."""
+        if self.reward_members:
+            return self.rewards(feat).mean(-1)
         return two_hot_mean(self.reward_head(feat), self.bin_range)
+
+    def rewards(self, feat: Tensor) -> Tensor:
+        """Predict the reward by each of the heads: (..., D + S*K) -> (..., members)."""
+        heads = [self.reward_head, *self.reward_members]
+        return torch.stack([two_hot_mean(head(feat), self.bin_range) for head in heads], -1)
 
     def goes_on(self, feat: Tensor) -> Tensor:
         """Predict the probability that the episode goes on after a state: (..., D + S*K) -> (...).

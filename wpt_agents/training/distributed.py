@@ -179,7 +179,7 @@ class Divided:
         self.options = options
         self.objective: nn.Module = _Objective(model, options)
         if world.size > 1:
-            with frozen(model.reward_head):  # DDP waits for the gradients of all else
+            with frozen(*model.heads):  # DDP waits for the gradients of all else
                 self.objective = DistributedDataParallel(self.objective)
 
     def backward(self, share: Batch, device: torch.device, seed: int) -> WorldModelLoss:

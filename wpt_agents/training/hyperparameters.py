@@ -202,6 +202,16 @@ class Hyperparameters(Keywords):
         "the paper",
     )
 
+    reward_ensemble: int = count(
+        1, "reward heads. Of several, dreams are paid the mean, less what `pessimism` takes off"
+    )
+    pessimism: str | float = schedule(
+        0.0,
+        np.inf,
+        "β, or schedule of it: dreams are paid the mean of the reward heads minus β times their "
+        "standard deviation, so that states which no reward is known of are not sought; it should "
+        "fade, or exploration stops. Not in the paper",
+    )
     continue_head: bool = switch(
         True,
         "once an episode of the task has terminated, learn where episodes end, and let imagined "
@@ -266,6 +276,11 @@ class Hyperparameters(Keywords):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "size", plain_size(self.size))
+        if self.pessimistic and self.reward_ensemble == 1:
+            raise ValueError(
+                f"pessimism={self.pessimism!r} takes off what several reward heads deviate by, "
+                "but reward_ensemble=1: use reward_ensemble=3 or more, or pessimism=0"
+            )
         if self.imitates and self.batch_length < FRAMES:
             raise ValueError(
                 f"kickstart looks at {FRAMES} images in a row, but batch_length="
@@ -287,6 +302,15 @@ class Hyperparameters(Keywords):
     def marks(self) -> bool:
         """Whether batches must mark the pixels that move."""
         return self.pixel_weight != 1
+
+    @property
+    def pessimistic(self) -> bool:
+        """Whether dreams are ever paid less than the mean of the reward heads."""
+        return ever(parse_schedule(self.pessimism, np.inf, "pessimism"))
+
+    def pessimism_at(self, step: int) -> float:
+        """Return what the reward heads' deviation is multiplied by at this step."""
+        return parse_schedule(self.pessimism, np.inf, "pessimism")(step)
 
     @property
     def imitates(self) -> bool:

@@ -25,6 +25,7 @@ from wpt_agents.model.dreamer_v3 import (
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
+from wpt_agents.model.world_model import pessimistic_reward
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.world_model_learner import Metrics as Metrics
 from wpt_agents.training.world_model_learner import WorldModelLearner
@@ -233,8 +234,12 @@ class Learner(WorldModelLearner):
         :param starts: (N,), the numbers of the dreams' first states in the batch
         """
         model = self.policy.world_model
+        states = dream.states.but_last()
         with frozen(model):
-            return over_steps(model.reward, dream.states.but_last())
+            if model.reward_members:
+                rewards = over_steps(model.rewards, states)
+                return pessimistic_reward(rewards, self.hyperparameters.pessimism_at(self.step))
+            return over_steps(model.reward, states)
 
     def imagined_continue(self, dream: Dream) -> Tensor | None:
         """Return the probability of going on after the steps 0 .. H-1, (N, H); None if certain."""

@@ -27,6 +27,7 @@ class Purpose(IntEnum):
     INITIALISE = 7
     REDRAW = 8  # of the networks, for the next task of a sequence
     CONTINUE = 9  # the continue head
+    ENSEMBLE = 10  # the further reward heads
     RESET = 100  # of the environment, before an explorer's episode
 
 

@@ -33,6 +33,7 @@ class WorldModelLearner:
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self.adam(parts, self.model_rate)
         self.add_continue_head()
+        self.add_reward_members()
 
     @property
     def model_rate(self) -> float:
@@ -45,6 +46,13 @@ class WorldModelLearner:
         if head := self.policy.world_model.continue_head:
             self.continue_optimizer = self.adam([list(head.parameters())], self.model_rate)
 
+    def add_reward_members(self) -> None:
+        """Make an optimiser of the world model's further reward heads, if it has any."""
+        self.members_optimizer: Optimizer | None = None
+        if members := self.policy.world_model.reward_members:
+            parts = [list(member.parameters()) for member in members]
+            self.members_optimizer = self.adam(parts, self.model_rate)
+
     def adam(self, parts: list[list[nn.Parameter]], rate: float) -> Optimizer:
         """Make an optimiser over parts whose gradients are clipped separately."""
         return descent.adam(parts, rate, self.hyperparameters.weight_decay)
@@ -52,9 +60,9 @@ class WorldModelLearner:
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
         self.hyperparameters = hyperparameters.resolved()
-        self.set_rate(self.model_optimizer, self.model_rate)
-        if self.continue_optimizer is not None:
-            self.set_rate(self.continue_optimizer, self.model_rate)
+        for optimizer in (self.model_optimizer, self.continue_optimizer, self.members_optimizer):
+            if optimizer is not None:
+                self.set_rate(optimizer, self.model_rate)
 
     def set_rate(self, optimizer: Optimizer, rate: float) -> None:
         """Set an optimiser's learning rate and weight decay."""
@@ -80,7 +88,26 @@ class WorldModelLearner:
                 total = total + reward
                 metrics["train/reward_loss"] = reward.detach()
         norm = self.descend(self.model_optimizer, total, "world model")
-        return post.detach(), metrics | world_model_metrics(loss, norm)
+        post = post.detach()
+        if learn_reward:
+            metrics |= self.update_reward_members(post, batch)
+        return post, metrics | world_model_metrics(loss, norm)
+
+    def update_reward_members(self, post: Latent, batch: Batch) -> Metrics:
+        """Take a step on the further reward heads, if there are any."""
+        model = self.policy.world_model
+        if self.members_optimizer is None:
+            return {}
+        feat = post.feat
+        with self.autocast():
+            losses = [
+                reward_loss(head(feat), batch.reward, batch.reward_known, model.bin_range)
+                for head in model.reward_members
+            ]
+        self.descend(self.members_optimizer, torch.stack(losses).sum(), "reward ensemble")
+        with torch.no_grad(), self.autocast():
+            spread = model.rewards(feat).std(-1, correction=0).mean()
+        return {"train/reward_disagreement": spread}
 
     def update_continue_head(self, post: Latent, batch: Batch) -> Metrics:
         """Take a step on the continue head, if there is one, on the rows of the task itself."""

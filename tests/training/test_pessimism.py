@@ -64,9 +64,9 @@ def test_all_heads_learn_the_rewards_and_the_mean_is_predicted():
     world_model = model.policy.world_model
     feat = torch.randn(5, 64 + 64)
     heads = [world_model.reward_head, *world_model.reward_members]
-    each = torch.stack([two_hot_mean(head(feat)) for head in heads])
-    torch.testing.assert_close(world_model.reward(feat), each.mean(0))
-    assert each.std(0).min() > 0  # three different heads
+    predictions = torch.stack([two_hot_mean(head(feat)) for head in heads])
+    torch.testing.assert_close(world_model.reward(feat), predictions.mean(0))
+    assert predictions.std(0).min() > 0  # three different heads
     assert metrics["train/reward_disagreement"][-1] > 0
     before = [p.detach().clone() for p in world_model.reward_members.parameters()]
     model.update(metrics)

@@ -41,7 +41,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 
 def save_until_killed(path, number):
     model = agent(seed=1)
-    kill_at_change(number)
+    kill_at_change(number, every=20)
     model.save(path)
 
 

@@ -67,13 +67,15 @@ NAMES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir"}  # audit events, as P
 WRITES = {"write", "sendfile"}  # functions written in C that put bytes into a file
 
 
-def kill_at_change(number):
+def kill_at_change(number, every=1):
     """Kills this process right before change `number` of the file system.
 
     A change is an opening for writing, a write, an fsync, and a name that is made, changed or
     removed. What is in a buffer of Python's when the process is killed is lost, as in life.
+
+    :param every: of the writes, which are hundreds in a model file, count each `every`-th only
     """
-    calls, fsync = count(), os.fsync
+    calls, writes, fsync = count(), count(), os.fsync
 
     def step():
         if next(calls) == number:
@@ -84,7 +86,7 @@ def kill_at_change(number):
             step()
 
     def profile(_, event, function):
-        if event == "c_call" and function.__name__ in WRITES:
+        if event == "c_call" and function.__name__ in WRITES and next(writes) % every == 0:
             step()
 
     def counted_fsync(descriptor):

@@ -1,6 +1,5 @@
 """Files that other programs read during a run are whole at every moment."""
 
-import shutil
 from itertools import count
 
 import numpy as np
@@ -19,9 +18,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 
 def evaluating(folder, steps):
     """Learns for some steps, with an evaluation of one episode after every seventh."""
+    return agent(ClockEnv()).learn(steps, callback=evaluations_in(folder))
+
+
+def evaluations_in(folder):
     venv = DummyVecEnv([lambda: EpisodeSeeds(Monitor(ClockEnv()))])
-    callback = Evaluations(venv, n_eval_episodes=1, eval_freq=7, log_path=str(folder), verbose=0)
-    agent(ClockEnv()).learn(steps, callback=callback)
+    return Evaluations(venv, n_eval_episodes=1, eval_freq=7, log_path=str(folder), verbose=0)
 
 
 def evaluations(folder):
@@ -45,24 +47,28 @@ def test_the_evaluations_are_whole_while_new_ones_are_written(tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["evaluations.npz"]
 
 
-def evaluate_until_killed(folder, number):
+def evaluate_until_killed(callback, number):
     kill_at_change(number)
-    evaluating(folder, 14)
+    callback._on_step()
 
 
-@pytest.mark.slow
-def test_killed_at_any_write_the_evaluations_are_whole(tmp_path):
-    states = set()
+def test_killed_at_any_write_the_evaluations_are_those_before_or_after(tmp_path):
+    path = tmp_path / "evaluations.npz"
+    model = evaluating(tmp_path, 7)
+    before = path.read_bytes()
+    model.learn(7, reset_num_timesteps=False)
+    callback = evaluations_in(tmp_path)
+    callback.init_callback(model)
+    callback.num_timesteps = model.num_timesteps
+    states = []
     for number in count():
-        folder = tmp_path / "run"
-        folder.mkdir()
-        over = not killed(evaluate_until_killed, folder, number)
-        there = (folder / "evaluations.npz").exists()
-        states.add(tuple(evaluations(folder)) if there else None)
-        shutil.rmtree(folder)
+        path.write_bytes(before)
+        over = not killed(evaluate_until_killed, callback, number)
+        states.append(evaluations(tmp_path))
         if over:
             break
-    assert states == {None, (7,), (7, 14)}
+    assert states[0] == [7] and states[-1] == [7, 14]
+    assert all(times in ([7], [7, 14]) for times in states) and len(states) > 3
 
 
 def write_results_until_killed(folder, number):

@@ -30,7 +30,7 @@ def content(folder):
 
 @pytest.mark.slow
 def test_killed_at_any_write_a_conversion_is_continued_to_the_same_bytes(tmp_path, monkeypatch):
-    monkeypatch.setattr(shards, "SHARD_BYTES", 1_000)  # so that each trajectory begins a shard
+    monkeypatch.setattr(shards, "SHARD_BYTES", 10)  # so that each trajectory begins a shard
     for i in range(3):
         save_npz(tmp_path / f"in/{i}.npz", chain(30 + i, i))
     convert(tmp_path / "in", tmp_path / "whole")

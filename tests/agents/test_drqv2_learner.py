@@ -1,6 +1,7 @@
 """DrQ-v2's update equals a plain second implementation, and each loss moves its own networks."""
 
 import numpy as np
+import pytest
 import torch
 from gymnasium import spaces
 from plain import Adam, assert_close, batch_of, encode, parameters, trunk, two_layers
@@ -17,8 +18,9 @@ def policy_of(actions=2, seed=0):
     return DrQv2Policy(IMAGES, space, channels=3, feature_dim=5, hidden_dim=7)
 
 
-def learner_of(policy):
-    return DrQv2Learner(policy, DrQv2Keywords(learning_rate=RATE, tau=TAU, std_clip=CLIP))
+def learner_of(policy, **changes):
+    keywords = DrQv2Keywords(learning_rate=RATE, tau=TAU, std_clip=CLIP, **changes)
+    return DrQv2Learner(policy, keywords)
 
 
 def copies(module):
@@ -32,7 +34,8 @@ def changed(module, before):
 class Reference:
     """One update of DrQ-v2, written out."""
 
-    def __init__(self, policy):
+    def __init__(self, policy, pre_activation=0.0):
+        self.pre_activation = pre_activation
         self.f, self.q, self.mu = (
             parameters(m) for m in (policy.encoder, policy.critic, policy.actor)
         )
@@ -59,16 +62,18 @@ class Reference:
         q1, q2 = self.both(self.q, h, batch.action)
         self.critic_adam.descend(((q1 - y) ** 2).mean() + ((q2 - y) ** 2).mean())
         h = h.detach()
-        self.actor_adam.descend(
-            -torch.minimum(*self.both(self.q, h, self.action(h, generator))).mean()
-        )
+        u = two_layers(self.mu, "layers", trunk(self.mu, h))
+        q = torch.minimum(*self.both(self.q, h, self.action(h, generator)))
+        self.actor_adam.descend(-q.mean() + self.pre_activation * (u**2).mean())
         for k, w in self.target.items():
             w.copy_((1 - TAU) * w + TAU * self.q[k].detach())
 
 
-def test_three_updates_equal_a_plain_second_implementation():
+@pytest.mark.parametrize("pre_activation", [0.0, 0.5])
+def test_three_updates_equal_a_plain_second_implementation(pre_activation):
     policy = policy_of()
-    learner, reference = learner_of(policy), Reference(policy)
+    learner = learner_of(policy, pre_activation=pre_activation)
+    reference = Reference(policy, pre_activation)
     before = copies(policy.encoder)
     ours, theirs = torch.Generator().manual_seed(5), torch.Generator().manual_seed(5)
     for seed in range(3):

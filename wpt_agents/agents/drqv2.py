@@ -44,10 +44,14 @@ class Actor(nn.Module):
         self.trunk = Trunk(embed_dim, features)
         self.layers = mlp(features, hidden, action_dim)
 
+    def before_tanh(self, embed: Tensor) -> Tensor:
+        """(N, E) -> (N, A), u of the mean action tanh(u)."""
+        u: Tensor = self.layers(self.trunk(embed))
+        return u
+
     def forward(self, embed: Tensor) -> Tensor:
         """(N, E) -> (N, A), the mean action in (-1, 1)."""
-        mean: Tensor = self.layers(self.trunk(embed)).tanh()
-        return mean
+        return self.before_tanh(embed).tanh()
 
 
 class Critic(nn.Module):
@@ -135,6 +139,11 @@ class DrQv2Keywords(FrameKeywords):
         "ones; shorten it for short runs, or they never act on what they learned",
     )
     std_clip: float = amount(0.3, "largest noise in targets and in the actor's loss")
+    pre_activation: float = amount(
+        0.0,
+        "weight of the mean square of the actor's output before tanh in its loss, as in MR.Q; not "
+        "in DrQ-v2. Short runs need it, or tanh saturates early and recovers slowly",
+    )
     update_every: int = count(2, "collected steps that pay for one update")
 
 
@@ -215,9 +224,12 @@ class DrQv2Learner:
         value_loss = critic_loss(q, target)
         descend(self.critic_optimizer, value_loss, "critic")
         embed = embed.detach()  # the actor's loss does not train the encoder
-        action = noisy_action(policy.actor(embed), std, clip, generator)
+        before_tanh = policy.actor.before_tanh(embed)
+        action = noisy_action(before_tanh.tanh(), std, clip, generator)
         with frozen(policy.critic):
             loss = actor_loss(policy.critic(embed, action))
+        if self.settings.pre_activation:
+            loss = loss + self.settings.pre_activation * before_tanh.square().mean()
         descend(self.actor_optimizer, loss, "actor")
         ema_update(policy.target_critic, policy.critic, self.settings.tau)
         return {

@@ -7,6 +7,7 @@ from wpt_envs import tasks as table
 from wpt_envs.tasks import Task
 
 from wpt_agents.files.names import unknown_name
+from wpt_agents.zoo.result import Metric
 
 
 def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
@@ -43,3 +44,9 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
 def short_name(task: Task) -> str:
     """'dmc-walker-run', as folders and tables call it."""
     return f"{task.suite}-{task.name}"
+
+
+def metric_of(task: Task) -> Metric:
+    """Return what the task counts, typed."""
+    assert task.metric in ("return", "success"), task
+    return "success" if task.metric == "success" else "return"

@@ -3,10 +3,13 @@
 The measure: cells of a histogram over torso height (0 to 1.6 m, 16 bins), pitch (a full turn, 24
 bins) and horizontal speed (-4 to 4 m/s, 16 bins) that at least one step ended in; what lies outside
 counts in the outermost bins.
+
+Frames are those of the episodes that a dataset would hold. `explore-state` learns before, from the
+simulator's state alone, and plays the policies of five stages of that in turn.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -15,10 +18,17 @@ import numpy as np
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions
-from wpt_agents.zoo.collect.episodes import record
+from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY, record
+from wpt_agents.zoo.collect.state_curiosity import (
+    STEPS,
+    StatePolicy,
+    explore_states,
+    state_policy,
+)
 
 TASK = "wpt/dmc-walker-stand-v0"
-BEHAVIOURS = ("random", "noise", "icm", "plan2explore")
+BEHAVIOURS = ("random", "noise", STATE_CURIOSITY, "icm", "plan2explore")
+ENV = {"rendering": "fast", "state_in_info": True}
 EPISODES = 20  # of 500 steps of 2 frames: 20,000 frames
 SMALL = {  # quick enough for a processor
     **EXPLORE,
@@ -60,27 +70,43 @@ def explore(behaviour: str, seed: int, episodes: int, **settings: Any) -> np.nda
     """The states (N, 24) that a way of exploring passes through."""
     learns = behaviour in EXPLORERS
     size = 64 if learns else 16  # who does not look needs no picture
-    made = gym.make(TASK, rendering="fast", state_in_info=True, image_size=size)
-    with closing(Watched(made)) as env:
+    stages = []
+    if behaviour == STATE_CURIOSITY:
+        stages = [state_policy(w) for w in explore_states(TASK, ENV, settings["steps"], seed)]
+    with closing(Watched(gym.make(TASK, image_size=size, **ENV))) as env:
         if learns:
             model = EXPLORERS[behaviour]("WPTPolicy", env, max_action_dim=6, seed=seed, **settings)
             for _ in model.explore(episodes):
                 pass
         else:
-            actions = {"noise": noise_actions, "random": random_actions}[behaviour]
+            actions = {"noise": noise_actions, "random": random_actions}
             for episode in range(episodes):
                 rng = np.random.default_rng([seed, episode])
-                act: Act = actions(rng, 6, 500)[0]
+                if stages:
+                    act = by_state(stages[episode % len(stages)], rng)
+                else:
+                    act = actions[behaviour](rng, 6, 500)[0]
                 record(env, act, int(rng.integers(2**31)))
         return np.stack(env.states)
 
 
-def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
-    """The cells that each behaviour occupies, seed by seed."""
-    for behaviour in BEHAVIOURS:
+def by_state(policy: StatePolicy, rng: np.random.Generator) -> Act:
+    """Return a policy that sees the simulator's state as what plays an episode."""
+    return lambda obs, info, step: policy(info["state"], rng)
+
+
+def rows(
+    quick: bool = False, behaviours: Sequence[str] = BEHAVIOURS, steps: int = STEPS
+) -> Iterator[dict[str, Any]]:
+    """The cells that each behaviour occupies, seed by seed.
+
+    :param steps: calls of `env.step` in which `explore-state` learns
+    """
+    for behaviour in behaviours:
+        settings = {"steps": 500 if quick else steps} if behaviour == STATE_CURIOSITY else SMALL
         for seed in range(1 if quick else 3):
             start = time.process_time()
-            states = explore(behaviour, seed, 2 if quick else EPISODES, **SMALL)
+            states = explore(behaviour, seed, 2 if quick else EPISODES, **settings)
             yield {
                 "behaviour": behaviour,
                 "seed": seed,

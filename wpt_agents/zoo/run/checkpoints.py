@@ -26,8 +26,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.archive import sync_folder
 
+BEST_MODEL = "best_model.zip"
 HEAD_START_MODEL = "head_start_model.zip"
-LOGS = ("0.monitor.csv", "progress.csv", "evaluations.npz", "best_model.zip", HEAD_START_MODEL)
+LOGS = ("0.monitor.csv", "progress.csv", "evaluations.npz", BEST_MODEL, HEAD_START_MODEL)
 KEEP = 2
 STATE = "state.json"
 

@@ -15,12 +15,11 @@ from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.pictures import runs as pictures
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import BEST, HEAD_START, LAST, PRIOR_ACTOR, Score
-from wpt_agents.zoo.run.checkpoints import HEAD_START_MODEL
+from wpt_agents.zoo.run.checkpoints import BEST_MODEL, HEAD_START_MODEL
 from wpt_agents.zoo.run.shared import play_untrained
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import say
 
-BEST_MODEL = "best_model.zip"
 CONTEXT = 5  # images that the world model sees before it predicts
 HORIZON = 40  # images that it then predicts
 

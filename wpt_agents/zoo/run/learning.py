@@ -18,10 +18,16 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.judge.evaluation import episode_steps, make_vec_env
 from wpt_agents.zoo.pictures import retrieval
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.run.checkpoints import Checkpoint, Checkpoints, HeadStart, resumes
+from wpt_agents.zoo.run.checkpoints import (
+    BEST_MODEL,
+    Checkpoint,
+    Checkpoints,
+    HeadStart,
+    resumes,
+)
 from wpt_agents.zoo.run.logs import ContinuedCSV, Evaluations, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
-from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.tasks import metric_of, short_name
 from wpt_agents.zoo.terminal import say
 
 APART = 10_000  # between the seeds of the evaluations during fine-tuning and of those at its end
@@ -159,10 +165,11 @@ def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
     with closing(run.algorithm.wrap(venv) if run.algorithm.wrap else venv) as wrapped:
         callback = Evaluations(
             wrapped,
+            metric=metric_of(run.task),
+            keep=run.folder / BEST_MODEL if settings.keep_best else None,
             n_eval_episodes=settings.during_episodes,
             eval_freq=max(1, settings.every // run.preset.env.action_repeat),
             log_path=str(run.folder),
-            best_model_save_path=str(run.folder) if settings.keep_best else None,
             deterministic=True,
             verbose=0,
         )

@@ -2,15 +2,43 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
+from wpt_agents.zoo.result import Metric
+
 
 class Evaluations(EvalCallback):
-    """SB3's EvalCallback, which continues the evaluations of its folder and the best of them."""
+    """SB3's EvalCallback, which continues the evaluations of its folder and the best of them.
+
+    The best policy is the one of the highest mean return, or where the task's score is its success
+    rate, of the most successes, and among equal ones of the highest return. The first of equals is
+    kept.
+
+    :param metric: the task's, "return" or "success"
+    :param keep: the file that the best model is written to; None for no such file
+    """
+
+    def __init__(
+        self, eval_env: VecEnv, metric: Metric = "return", keep: Path | None = None, **keywords: Any
+    ) -> None:
+        super().__init__(eval_env, **keywords)
+        self.metric = metric
+        self.keep = keep
+
+    @property
+    def scores(self) -> list[tuple[float, ...]]:
+        """What each evaluation so far is judged by; the larger, the better."""
+        returns = [float(np.mean(episodes)) for episodes in self.evaluations_results]
+        if self.metric == "return":
+            return [(value,) for value in returns]
+        assert len(self.evaluations_successes) == len(returns), "the task reports no successes"
+        rates = [float(np.mean(episodes)) for episodes in self.evaluations_successes]
+        return list(zip(rates, returns, strict=True))
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -44,6 +72,9 @@ class Evaluations(EvalCallback):
         finally:
             self.log_path = str(path.with_suffix(""))
         os.replace(aside, path)
+        *before, now = self.scores
+        if self.keep is not None and all(now > score for score in before):
+            self.model.save(self.keep)
         return go_on
 
 

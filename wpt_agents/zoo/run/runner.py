@@ -13,20 +13,19 @@ from pathlib import Path
 import yaml
 from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
-from wpt_envs.tasks import Task
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import tables
-from wpt_agents.zoo.result import Metric, Result, Score, read_result, write_result
+from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run.checkpoints import LOGS, Checkpoint, last_checkpoint, remove_checkpoints
 from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
 from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
 from wpt_agents.zoo.run.locks import locked, write_json
 from wpt_agents.zoo.run.shared import collect_data, pretrain
-from wpt_agents.zoo.tasks import short_name
+from wpt_agents.zoo.tasks import metric_of, short_name
 from wpt_agents.zoo.terminal import console, say
 
 
@@ -127,12 +126,6 @@ def do_stages(job: Run) -> Result:
     write_result(job.folder, result)
     remove_checkpoints(job.folder)
     return result
-
-
-def metric_of(task: Task) -> Metric:
-    """Return what the task counts, typed."""
-    assert task.metric in ("return", "success"), task
-    return "success" if task.metric == "success" else "return"
 
 
 def prepare_logs(job: Run, checkpoint: Checkpoint | None) -> None:

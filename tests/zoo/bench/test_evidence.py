@@ -28,12 +28,19 @@ def test_coverage_counts_each_cell_once_and_what_lies_outside_at_the_edge():
     assert exploration.coverage(states((9.0, 0.1, 99.0), (1.55, 0.1, 3.9))) == 1
 
 
-@pytest.mark.parametrize("behaviour", ["random", "noise"])
+@pytest.mark.parametrize("behaviour", ["random", "noise", "explore-state"])
 def test_states_are_those_of_the_frames_that_are_counted(behaviour):
-    one = exploration.explore(behaviour, 0, 1)
+    one = exploration.explore(behaviour, 0, 1, steps=50)
     assert one.shape == (500, 24)  # of 2 frames each
     assert one[:, 14].min() > 0 and exploration.coverage(one) > 20
-    assert not np.array_equal(one, exploration.explore(behaviour, 1, 1))
+    assert not np.array_equal(one, exploration.explore(behaviour, 1, 1, steps=50))
+
+
+def test_only_the_behaviours_that_are_asked_for_are_measured():
+    (row,) = exploration.rows(quick=True, behaviours=["random"])
+    assert row["behaviour"] == "random" and row["frames"] == 2000
+    with pytest.raises(ValueError, match="explore-state"):
+        next(exploration.rows(quick=True, behaviours=["explore-stat"]))
 
 
 def test_shares_count_the_querys_own_kind_among_the_nearest(tmp_path):

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
+from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions
 from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY, record
 from wpt_agents.zoo.collect.state_curiosity import (
@@ -28,7 +29,7 @@ from wpt_agents.zoo.collect.state_curiosity import (
 
 TASK = "wpt/dmc-walker-stand-v0"
 BEHAVIOURS = ("random", "noise", STATE_CURIOSITY, "icm", "plan2explore")
-ENV = {"rendering": "fast", "state_in_info": True}
+ENV: dict[str, Any] = {"rendering": "fast", "state_in_info": True}
 EPISODES = 20  # of 500 steps of 2 frames: 20,000 frames
 SMALL = {  # quick enough for a processor
     **EXPLORE,
@@ -103,6 +104,8 @@ def rows(
     :param steps: calls of `env.step` in which `explore-state` learns
     """
     for behaviour in behaviours:
+        if behaviour not in BEHAVIOURS:
+            raise unknown_name("behaviour", behaviour, BEHAVIOURS)
         settings = {"steps": 500 if quick else steps} if behaviour == STATE_CURIOSITY else SMALL
         for seed in range(1 if quick else 3):
             start = time.process_time()

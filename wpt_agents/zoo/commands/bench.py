@@ -57,6 +57,14 @@ def bench(
     updates: Annotated[
         int | None, typer.Option(min=1, help="For prediction: the updates of each model.")
     ] = None,
+    behaviour: Annotated[
+        list[str] | None,
+        typer.Option(help="For exploration: measure this behaviour only; can be repeated."),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="For exploration: the steps that explore-state learns from."),
+    ] = None,
     probe: Annotated[
         bool,
         typer.Option(
@@ -90,6 +98,8 @@ def bench(
         "precision": str(precision),
         "peer": peer,
         "updates": updates,
+        "behaviours": behaviour,
+        "steps": steps,
     }
     for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
         try:
@@ -110,7 +120,8 @@ def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
     from wpt_agents.zoo.bench.timing import forget_peak, peak_rss_mb
 
     taken = inspect.signature(module.rows).parameters
-    rows = module.rows(**{key: value for key, value in options.items() if key in taken})
+    chosen = {key: value for key, value in options.items() if key in taken and value is not None}
+    rows = module.rows(**chosen)
     forget_peak()
     for row in rows:
         yield row | {"rss_mb": row.get("rss_mb", peak_rss_mb())}

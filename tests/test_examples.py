@@ -1,6 +1,7 @@
 """Every script in examples/ runs, at a small size."""
 
 import importlib
+import os
 import re
 import signal
 import subprocess
@@ -93,3 +94,15 @@ def test_a_killed_run_is_resumed(tmp_path):
 def test_every_script_is_listed():
     page = (EXAMPLES / "README.md").read_text()
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(re.findall(r"\[(\w+\.py)\]", page))
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_script_for_a_gpu_runs_on_a_cpu(tmp_path):
+    words = ["bash", str(EXAMPLES / "gpu.sh"), "--quick"]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"OUT": str(tmp_path), "PATH": path}
+    ran = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=900)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert (tmp_path / "bench.jsonl").read_text().count("pre-training") >= 1
+    assert len(list((tmp_path / "runs").glob("debug/wpt/*/result.json"))) == 1

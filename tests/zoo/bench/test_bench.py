@@ -16,8 +16,8 @@ from wpt_agents.model.layers import BlockLinear, UpConv
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.model.world_model import reconstruction_error
+from wpt_agents.zoo.bench import gpu, policy, profile, replay, scaling, timing, work
 from wpt_agents.zoo.bench import model as bench_model
-from wpt_agents.zoo.bench import policy, profile, replay, scaling, timing, work
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.commands.options import print_table
 
@@ -40,6 +40,18 @@ def test_the_model_bench_prints_a_json_object_for_each_case():
         assert torch.cuda.is_available() or row["onednn_gflop_per_s"] > 1
     alone, whole = rows
     assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
+
+
+def test_the_gpu_bench_measures_both_steps_and_needs_a_gpu():
+    ran = CliRunner().invoke(app, ["bench", "gpu", "--quick", "--json"])
+    assert ran.exit_code == 0, ran.output
+    alone, whole = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert (alone["what"], whole["what"]) == ("pre-training", "whole update")
+    assert whole["launches"] > alone["launches"] > 100 and whole["tflop"] > alone["tflop"] > 0
+    assert alone["wall_s"] > 0 and 0 <= alone["launch_share"] <= 1
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="torch finds none"):
+            next(gpu.rows())
 
 
 def test_several_threads_take_turns_with_one():

@@ -43,7 +43,10 @@ def test_a_peer_that_is_not_here_is_named_with_the_line_that_installs_it(monkeyp
         (["policy", "--peer", "sheeprl"], "--peer goes with bench model, not with bench policy"),
         (["--peer", "sheeprl"], "not with bench all"),
         (["model", "--peer", "sheeprl", "--precision", "bf16"], "--peer measures in fp32"),
-        (["policy", "--compile"], "--compile goes with bench model, and not with --peer"),
+        (
+            ["policy", "--compile"],
+            "--compile goes with bench model and bench gpu, and not with --peer",
+        ),
         (["model", "--plot", "x.png"], "--plot goes with bench scaling, not with bench model"),
     ],
 )

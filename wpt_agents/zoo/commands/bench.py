@@ -18,8 +18,8 @@ from wpt_agents.zoo.commands.options import print_table
 
 Case = StrEnum(
     "Case",
-    "model scaling profile work policy replay data envs retrieval prediction exploration threads "
-    "all",
+    "model scaling profile work gpu policy replay data envs retrieval prediction exploration "
+    "threads all",
 )
 Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])
@@ -44,7 +44,7 @@ def bench(
         bool,
         typer.Option(
             "--compile",
-            help="For model: compile scan and imagination by torch.compile, which takes minutes.",
+            help="For model and gpu: compile scan and imagination by torch.compile, in minutes.",
         ),
     ] = False,
     peer: Annotated[
@@ -86,8 +86,8 @@ def bench(
         raise ValueError(f"--peer goes with bench model, not with bench {case}")
     if plot and case != Case.scaling:
         raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
-    if compiled and (peer or case != Case.model):
-        raise ValueError("--compile goes with bench model, and not with --peer")
+    if compiled and (peer or case not in (Case.model, Case.gpu)):
+        raise ValueError("--compile goes with bench model and bench gpu, and not with --peer")
     if probe and case != Case.prediction:
         raise ValueError(f"--probe goes with bench prediction, not with bench {case}")
     options: dict[str, Any] = {
@@ -101,7 +101,8 @@ def bench(
         "behaviours": behaviour,
         "steps": steps,
     }
-    for name in [c for c in Case if c != Case.all] if case == Case.all else [case]:
+    everywhere = [c for c in Case if c not in (Case.all, Case.gpu)]  # the case gpu needs one
+    for name in everywhere if case == Case.all else [case]:
         try:
             module = importlib.import_module(f"wpt_agents.zoo.bench.{'peers' if peer else name}")
             measured = _show(str(name), _rows(module, options), as_json)

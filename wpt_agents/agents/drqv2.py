@@ -16,13 +16,14 @@ from torch import Generator, Tensor, nn
 from torch.optim import Adam
 
 from wpt_agents.agents.base import Metrics
-from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, descend
+from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords
 from wpt_agents.data.transitions import Transitions
 from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.frames import FrameEncoder, Trunk, mlp, orthogonal
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.sizes import Size
+from wpt_agents.training.descent import descend
 from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.training.keywords import Stage, amount, count, schedule, share
 from wpt_agents.training.randomness import Purpose
@@ -270,11 +271,6 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
     def make_learner(self) -> DrQv2Learner:
         """Make the optimisers."""
         return DrQv2Learner(self.policy, self.hyperparameters)
-
-    @property
-    def updates_per_step(self) -> float:
-        """How many updates a collected step pays for."""
-        return 1 / self.hyperparameters.update_every
 
     @property
     def std_now(self) -> float:

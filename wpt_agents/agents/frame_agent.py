@@ -10,8 +10,6 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
-from torch import Tensor
-from torch.optim import Optimizer
 
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.data.convert import Data
@@ -41,6 +39,7 @@ class FrameKeywords(Keywords):
     learning_rate: float = amount(1e-4, "learning rate of all networks")
     batch_size: int = count(256, "transitions in a batch")
     gamma: float = share(0.99, "discount of one step")
+    update_every: int = count(1, "collected steps that pay for one update")
     pad: int = count(4, "pixels by which images are shifted at most", least=0)
     task: str | None = keyword(
         None,
@@ -116,6 +115,11 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     def unbound_action_space(self) -> spaces.Box:
         """Return the action space of an agent without an environment; `set_env` replaces it."""
         return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    @property
+    def updates_per_step(self) -> float:
+        """How many updates a collected step pays for."""
+        return 1 / self.hyperparameters.update_every
 
     @property
     def offline_rewards(self) -> bool:
@@ -207,19 +211,3 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         self.retrieved = None
         self.progress.reset("retrieved_ids", "retrieved_of", "cloned")
         super().reset_task()
-
-
-def descend(optimizer: Optimizer, loss: Tensor, name: str) -> None:
-    """Take one optimiser step, unless the loss is not finite.
-
-    :raises FloatingPointError: the loss is not finite; the weights are as before
-    """
-    # DrQ-v2 clips no gradients, so there is no norm to look at, as `training.descent` does.
-    if not loss.isfinite():
-        raise FloatingPointError(
-            f"The {name} loss is {loss.item()}; this step was not taken and the weights are as "
-            "before: look at the rewards or lower the learning rate"
-        )
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()

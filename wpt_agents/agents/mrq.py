@@ -14,11 +14,10 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
-from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 
 from wpt_agents.agents.base import Metrics
-from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, FrameProgress, descend
+from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, FrameProgress
 from wpt_agents.data.transitions import Steps, Transitions, draw_steps
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.layers import frozen
@@ -34,6 +33,7 @@ from wpt_agents.model.mrq import (
     xavier_relu,
 )
 from wpt_agents.model.sizes import Size
+from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, amount, count
 from wpt_agents.training.model_files import optimizers
 from wpt_agents.training.randomness import Purpose
@@ -64,7 +64,6 @@ class MRQKeywords(FrameKeywords):
     grad_clip: float = amount(20.0, "largest norm of the value functions' gradient")
     std: float = amount(0.2, "standard deviation of the noise on actions, also in targets")
     std_clip: float = amount(0.3, "largest noise in targets")
-    update_every: int = count(1, "collected steps that pay for one update")
     learning_starts: int = count(
         10_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )
@@ -193,7 +192,7 @@ class MRQLearner:
             features = policy.encoder(z, batch.action)
         q = policy.value(features)
         loss = value_loss(q, target)
-        self._descend_value(loss)
+        descend(self.value_optimizer, loss, "value", settings.grad_clip)
         with frozen(policy.encoder, policy.value):
             before_tanh = policy.actor(z)
             chosen = policy.value(policy.encoder(z, before_tanh.tanh()))
@@ -205,18 +204,6 @@ class MRQLearner:
             "train/q": scale * q.detach().mean(),
             "train/batch_reward": batch.reward.mean(),
         }
-
-    def _descend_value(self, loss: Tensor) -> None:
-        """Take a step of the value functions with a clipped gradient."""
-
-        def clip(*_: Any) -> None:
-            clip_grad_norm_(self.policy.value.parameters(), self.settings.grad_clip)
-
-        hook = self.value_optimizer.register_step_pre_hook(clip)
-        try:
-            descend(self.value_optimizer, loss, "value")
-        finally:
-            hook.remove()
 
 
 class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
@@ -248,11 +235,6 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
     def make_learner(self) -> MRQLearner:
         """Make the optimisers."""
         return MRQLearner(self.policy, self.hyperparameters)
-
-    @property
-    def updates_per_step(self) -> float:
-        """How many updates a collected step pays for."""
-        return 1 / self.hyperparameters.update_every
 
     def update(self, metrics: Metrics) -> None:
         """Make one update on the replay; before every `sync_every`th, those of the encoder."""

@@ -9,8 +9,8 @@ import torch
 from torch import Generator, Tensor
 from torch.optim import Optimizer
 
-from wpt_agents.agents.frame_agent import descend
 from wpt_agents.model.ensembles import RewardEnsemble
+from wpt_agents.training.descent import descend
 
 SHOWN = 0.8  # share of the online rows that each reward head learns from
 

@@ -19,7 +19,7 @@ from torch.optim import Adam
 from tqdm.auto import tqdm
 
 from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
-from wpt_agents.agents.frame_agent import FrameProgress, descend
+from wpt_agents.agents.frame_agent import FrameProgress
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.model_file import read_model
@@ -33,6 +33,7 @@ from wpt_agents.model.time_contrastive import (
     r3m_loss,
     random_crop,
 )
+from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, choice, count
 from wpt_agents.training.randomness import Purpose
 

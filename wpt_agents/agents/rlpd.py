@@ -17,7 +17,7 @@ from torch import Generator, Tensor, nn
 from torch.optim import Adam
 
 from wpt_agents.agents.base import Metrics
-from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, descend
+from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords
 from wpt_agents.agents.optimistic import label
 from wpt_agents.data.transitions import Transitions, concatenate
 from wpt_agents.model.actor_critic import ema_update
@@ -27,6 +27,7 @@ from wpt_agents.model.frames import FrameEncoder, xavier
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.sizes import Size
 from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
+from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, amount, choice, count, share
 from wpt_agents.training.randomness import Purpose
 
@@ -99,7 +100,6 @@ class RLPDKeywords(FrameKeywords):
     learning_rate: float = amount(3e-4, "learning rate of all networks")
     tau: float = share(0.005, "share by which the target networks move in an update")
     offline_ratio: float = share(0.5, "share of offline transitions in a batch; 0 for none")
-    update_every: int = count(1, "collected steps that pay for one update")
     learning_starts: int = count(
         1_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )
@@ -272,11 +272,6 @@ class RLPD(FrameAgent, keywords=RLPDKeywords):
     def make_learner(self) -> RLPDLearner:
         """Make the optimisers."""
         return RLPDLearner(self.policy, self.hyperparameters)
-
-    @property
-    def updates_per_step(self) -> float:
-        """How many updates a collected step pays for."""
-        return 1 / self.hyperparameters.update_every
 
     @property
     def wants_data(self) -> bool:

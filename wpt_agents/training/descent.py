@@ -1,5 +1,7 @@
 """One step of an optimiser, with clipped gradients, that keeps the weights finite."""
 
+from math import inf
+
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
@@ -21,10 +23,11 @@ def decay(rate: float, weight_decay: float) -> float:
     return weight_decay / rate if rate else 0.0
 
 
-def descend(optimizer: Optimizer, loss: Tensor, name: str, grad_clip: float) -> Tensor:
+def descend(optimizer: Optimizer, loss: Tensor, name: str, grad_clip: float = inf) -> Tensor:
     """Compute the gradients of a loss and take a step.
 
     :param name: of the loss, for the error
+    :param grad_clip: largest norm of the gradient of each part; infinite for no clipping
     :return: the gradient's norm before clipping, that of the first part
     :raises FloatingPointError: a loss or gradient that is not finite; the weights stay as they were
     """

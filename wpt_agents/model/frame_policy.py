@@ -5,17 +5,16 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import IMAGE_SIZE
-from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.observations import Observation, State, stack_frames, to_images
+from wpt_agents.model.observations import State, stack_frames
+from wpt_agents.model.pixel_policy import PixelPolicy
 from wpt_agents.model.sizes import Size
 
 
-class FramePolicy(BasePolicy):
+class FramePolicy(PixelPolicy):
     """Acts on the last three images. Subclasses say which networks there are and how they decide.
 
     The networks are as wide as the environment's own actions. They are drawn again whenever
@@ -26,8 +25,6 @@ class FramePolicy(BasePolicy):
     :param clone_size: the widths of the prior actor, or None for no prior actor
     """
 
-    action_space: spaces.Box
-    image_key: str | None = None  # the entry to see of Dict observations; their only image if None
     action_mask: Tensor  # (A,) bool, all True: nothing is padded
 
     def __init__(
@@ -110,37 +107,6 @@ class FramePolicy(BasePolicy):
     def executed(self, state: State, action: np.ndarray) -> State:
         """The state after another action than the policy's was taken: it holds no actions."""
         return state
-
-    def to_env(self, action: np.ndarray) -> np.ndarray:
-        """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's own action space."""
-        return to_bounds(action, self.action_space)
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """The action in the environment's own space, and the state to pass to the next call.
-
-        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
-            are converted
-        :param state: what the last call returned; None at the start
-        :param episode_start: (n,) bool, where an episode begins; None for nowhere
-        """
-        images, batched = to_images(observation, self.image_key)
-        action, state = self.act(images, state, episode_start, deterministic)
-        action = self.to_env(action)
-        return (action if batched else action[0]), state
-
-    def _predict(  # type: ignore[override]  # images alone, no dictionaries of them
-        self, observation: Tensor, deterministic: bool = False
-    ) -> Tensor:
-        """SB3's stateless form: every observation is taken for an episode's first."""
-        images, _ = to_images(observation.cpu().numpy())
-        action, _ = self.act(images, None, None, deterministic)
-        return torch.from_numpy(self.to_env(action)).to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "clone_size": self.clone_size}

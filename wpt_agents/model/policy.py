@@ -8,11 +8,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
-from wpt_agents.model.actions import to_bounds
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.model.choosing import actor_or_clone
@@ -20,14 +18,13 @@ from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
     IMAGE_SPACE,
-    Observation,
     State,
     check_episode_start,
     check_state,
     stack_frames,
-    to_images,
 )
 from wpt_agents.model.ops import op
+from wpt_agents.model.pixel_policy import PixelPolicy
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.sizes import Size
 from wpt_agents.model.world_model import WorldModel, world_model_update_loss
@@ -42,7 +39,7 @@ class Dream(NamedTuple):
     saturated: Tensor  # scalar, the share of the actor's means beyond 0.99
 
 
-class WPTPolicy(BasePolicy):
+class WPTPolicy(PixelPolicy):
     """World model, actor, critic, target critic and prior actor.
 
     :param observation_space: the environment's; images are converted in `predict`
@@ -55,13 +52,8 @@ class WPTPolicy(BasePolicy):
     :param bin_range: largest value of reward head and critic, in symlog space
     """
 
-    action_space: spaces.Box
-    average_actor: (
-        Actor | None
-    )  # a running average of `actor`, which acts in its place; not learned
+    average_actor: Actor | None  # of `actor` over updates, in whose place it acts
     ibrl: bool = False  # whether the prior actor's action is taken where it is worth more
-    image_key: str | None = None  # the entry to see of Dict observations; their only image if None
-    action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
 
@@ -204,36 +196,6 @@ class WPTPolicy(BasePolicy):
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array)).to(self.action_mask.device)
-
-    def to_env(self, action: np.ndarray) -> np.ndarray:
-        """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
-        return to_bounds(action, self.action_space)
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """Return the action in the environment's own space, and the state for the next call.
-
-        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
-            are converted
-        :param state: what the last call returned; None at the start
-        :param episode_start: (n,) bool, where an episode begins; None for nowhere
-        """
-        images, batched = to_images(observation, self.image_key)
-        action, state = self.act(images, state, episode_start, deterministic)
-        action = self.to_env(action)
-        return (action if batched else action[0]), state
-
-    def _predict(  # type: ignore[override]  # no dictionaries of images
-        self, observation: Tensor, deterministic: bool = False
-    ) -> Tensor:
-        """Act as SB3's stateless policies do: every observation is an episode's first."""
-        images, _ = to_images(observation.cpu().numpy())
-        return self._tensor(self.to_env(self.act(images, None, None, deterministic)[0]))
 
     def dream(self, start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
         """Imagine with the actor in the frozen world model; gradients run through the dynamics.

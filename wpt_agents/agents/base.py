@@ -19,6 +19,7 @@ Every keyword can be read as an attribute (`model.gamma`) and, as long as it tak
 A subclass may also override the methods below `# Hooks`.
 """
 
+import os
 import sys
 import time
 from abc import abstractmethod
@@ -35,6 +36,7 @@ from stable_baselines3.common.utils import safe_mean
 from torch import Tensor
 
 from wpt_agents.agents.saved import SavedAgent
+from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
@@ -240,3 +242,11 @@ class PixelAgent(SavedAgent):
         record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         record("train/updates", self.updates)
         self.logger.dump(step=self.num_timesteps)
+
+    def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Write the collected episodes to one file."""
+        self.replay_buffer.save(path)
+
+    def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
+        """Read what `save_replay_buffer` wrote."""
+        self.replay_buffer = ReplayBuffer.load(path)

@@ -1,6 +1,5 @@
 """What every agent keeps: keywords, random numbers, environment, model files and copies."""
 
-import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
@@ -240,12 +239,7 @@ class SavedAgent(KeywordAgent):
         if print_system_info:
             get_system_info()
         header, tensors = read_model(path)
-        expected = cls.saved_as or cls.__name__
-        kind = header.get("class", expected)
-        if kind != expected:
-            raise ValueError(
-                f"{path} is of {kind}: read it by {kind}.load, not {cls.__name__}.load"
-            )
+        model_files.check_class(header, path, cls.saved_as or cls.__name__)
         agent = cls(
             device=device, _init_setup_model=False, **{**header["hyperparameters"], **kwargs}
         )
@@ -294,14 +288,6 @@ class SavedAgent(KeywordAgent):
         model_files.check_same(header, self.hyperparameters.as_dict(), self.shape_keywords)
         self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
-
-    def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Write the collected episodes to one file."""
-        self.replay_buffer.save(path)
-
-    def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Read what `save_replay_buffer` wrote."""
-        self.replay_buffer = ReplayBuffer.load(path)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""

@@ -10,8 +10,7 @@ Example::
 
 import os
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -29,7 +28,7 @@ from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.model.sizes import Size
 from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone
-from wpt_agents.training.distributed import World, joined, local_device
+from wpt_agents.training.distributed import joined, local_device
 from wpt_agents.training.guidance import draw_window
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
@@ -42,7 +41,6 @@ NO_DATASET = (
     "None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, kickstart=0 if this "
     "is intended"
 )
-Callback = Callable[[int, dict[str, float]], Any]
 
 
 class WPT(WorldModelAgent, progress=WPTProgress):
@@ -83,7 +81,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         run_dir: str | os.PathLike[str] | None = None,
         seed: int | None = None,
         progress_bar: bool = False,
-        callback: Callback | None = None,
+        callback: pretraining.Callback | None = None,
         accumulate: int = 1,
         **kwargs: Any,
     ) -> Self:
@@ -117,39 +115,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
                 model.restore(*read_model(path), same)
             with model.operations():
-                model._pretrain(world, steps, accumulate, path, progress_bar, callback)
+                pretraining.pretrain(model, world, steps, accumulate, path, progress_bar, callback)
         if env is not None:
             model.set_env(env)
         return model
-
-    def _pretrain(
-        self,
-        world: World,
-        steps: int,
-        accumulate: int,
-        path: Path | None,
-        progress_bar: bool,
-        callback: Callback | None,
-    ) -> None:
-        assert self.dataset is not None
-        done = self.progress.pretrain_steps
-        facts = {"steps": steps, "pretrain_steps": done, "accumulate": accumulate}
-        facts |= self.hyperparameters.as_dict() | {"dataset": self.dataset.fingerprint}
-        world.check_same(facts)
-        self.adapt_to_data(self.dataset)
-        updates = pretraining.world_model_updates(
-            self.learner, self.dataset, self.streams, world, done, steps, accumulate, progress_bar
-        )
-        with closing(updates):
-            for metrics in updates:
-                done += 1
-                self.progress.pretrain_steps = done
-                if callback is not None and world.rank == 0:
-                    callback(done, {name: float(value) for name, value in metrics.items()})
-                if path is not None and (done % pretraining.EVERY == 0 or done == steps):
-                    if world.rank == 0:
-                        self.save(path)
-                    world.barrier()
 
     # // Task-Specific Training
 

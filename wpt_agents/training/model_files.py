@@ -60,6 +60,17 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for folder in folders for path in sorted(folder.glob("*.zip"))}
 
 
+def check_class(header: Mapping[str, Any], path: ModelPath, expected: str) -> None:
+    """Refuse a model file that another agent wrote.
+
+    :param expected: the name of the agent that wants to read it
+    :raises ValueError: naming the agent that can read it
+    """
+    kind = header.get("class", expected)
+    if kind != expected:
+        raise ValueError(f"{path} is of {kind}: read it by {kind}.load, not {expected}.load")
+
+
 def check_same(
     header: Mapping[str, Any], hyperparameters: Mapping[str, Any], names: tuple[str, ...]
 ) -> None:

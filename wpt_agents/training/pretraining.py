@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Generator
 from contextlib import closing
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -9,6 +11,8 @@ from tqdm.auto import tqdm
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.training.distributed import Divided, World
+from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.training.progress import WorldModelProgress
 from wpt_agents.training.randomness import Purpose, Streams, torch_seed
 from wpt_agents.training.world_model_learner import (
     Metrics,
@@ -19,6 +23,74 @@ from wpt_agents.training.world_model_learner import (
 EVERY = 1000  # updates between two model files
 
 Update = Callable[[Batch, int], Metrics]  # called with a batch and the update's number
+Callback = Callable[[int, dict[str, float]], Any]  # called with the updates made and the metrics
+
+
+class Pretrainable(Protocol):
+    """What an agent must have so that `pretrain` can train its world model."""
+
+    @property
+    def dataset(self) -> TrajectoryDataset | None:
+        """The trajectories to learn from."""
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        """The keywords."""
+
+    @property
+    def learner(self) -> WorldModelLearner:
+        """What updates the world model."""
+
+    @property
+    def progress(self) -> WorldModelProgress:
+        """The counters, of which `pretrain_steps` is raised."""
+
+    @property
+    def streams(self) -> Streams:
+        """The source of all random numbers."""
+
+    def adapt_to_data(self, data: TrajectoryDataset) -> None:
+        """Adapt a new world model to images of the data, once."""
+
+    def save(self, path: Path) -> None:
+        """Write the model file."""
+
+
+def pretrain(
+    model: Pretrainable,
+    world: World,
+    steps: int,
+    accumulate: int = 1,
+    path: Path | None = None,
+    progress_bar: bool = False,
+    callback: Callback | None = None,
+) -> None:
+    """Train a model's world model on its dataset, up to `steps` updates in all.
+
+    :param world: the processes that share the work; rank 0 alone writes files and calls back
+    :param accumulate: passes over a batch, or a process's share of it, to save memory
+    :param path: where the model file is written every 1000 updates and at the end
+    :param callback: called after every update
+    """
+    assert model.dataset is not None
+    done = model.progress.pretrain_steps
+    facts = {"steps": steps, "pretrain_steps": done, "accumulate": accumulate}
+    facts |= model.hyperparameters.as_dict() | {"dataset": model.dataset.fingerprint}
+    world.check_same(facts)
+    model.adapt_to_data(model.dataset)
+    updates = world_model_updates(
+        model.learner, model.dataset, model.streams, world, done, steps, accumulate, progress_bar
+    )
+    with closing(updates):
+        for metrics in updates:
+            done += 1
+            model.progress.pretrain_steps = done
+            if callback is not None and world.rank == 0:
+                callback(done, {name: float(value) for name, value in metrics.items()})
+            if path is not None and (done % EVERY == 0 or done == steps):
+                if world.rank == 0:
+                    model.save(path)
+                world.barrier()  # no process goes on, or ends, before the file is there
 
 
 def world_model_updates(

@@ -1,4 +1,4 @@
-"""TFRecord files of `tf.train.Example`s, read without TensorFlow.
+"""TFRecord files, whose records are a `tf.train.Example` each, read without TensorFlow.
 
 A record is its length (8 bytes), 4 bytes of checksum, the data and 4 more; an Example is a protocol
 buffer of named lists of bytes, floats or integers. The checksums are not verified; a file that is

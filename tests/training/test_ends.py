@@ -164,6 +164,19 @@ def test_a_model_that_was_saved_with_the_head_learns_on_exactly(tmp_path):
     assert same(weights(model), weights(loaded))
 
 
+def test_a_head_that_is_switched_off_is_neither_trained_nor_used(tmp_path):
+    ending().save(tmp_path / "model")
+    model = WPT.load(tmp_path / "model", continue_head=False)
+    model.replay_buffer.add(recorded(length=7, reward=np.zeros(7), terminated=True))
+    before, metrics = weights(model, HEAD), defaultdict(list)
+    model.update(metrics)
+    assert before and same(before, weights(model, HEAD)) and "train/continue_loss" not in metrics
+    imagined = model.learner.imagine(
+        model.policy.world_model.rssm.initial(2), torch.arange(2), torch.Generator()
+    )
+    assert imagined.goes_on is None
+
+
 def test_parameters_with_and_without_the_head_can_be_put_in(tmp_path):
     model, without = ending(), agent(ClockEnv()).learn(21)
     model.save(tmp_path / "model")

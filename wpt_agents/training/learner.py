@@ -244,7 +244,7 @@ class Learner(WorldModelLearner):
     def imagined_continue(self, dream: Dream) -> Tensor | None:
         """Return the probability of going on after the steps 0 .. H-1, (N, H); None if certain."""
         model = self.policy.world_model
-        if model.continue_head is None:
+        if model.continue_head is None or not self.hyperparameters.continue_head:
             return None
         with frozen(model):
             return over_steps(model.goes_on, dream.states.but_last())

@@ -112,7 +112,8 @@ class WorldModelLearner:
     def update_continue_head(self, post: Latent, batch: Batch) -> Metrics:
         """Take a step on the continue head, if there is one, on the rows of the task itself."""
         head = self.policy.world_model.continue_head
-        if head is None or self.continue_optimizer is None:
+        is_off = not self.hyperparameters.continue_head
+        if head is None or self.continue_optimizer is None or is_off:
             return {}
         known = batch.reward_known.any(1, keepdim=True).expand_as(batch.is_terminal)
         with self.autocast():

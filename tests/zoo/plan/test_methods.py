@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
+from dot_runs import SECTIONS, dot, job  # noqa: F401  (dot registers the task for each test)
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecFrameStack, VecTransposeImage
 from test_resume import killed_at
@@ -77,3 +77,11 @@ def test_a_pretrained_method_that_has_no_data_is_our_mistake(tmp_path, monkeypat
     monkeypatch.setitem(methods.METHODS, "drq", broken)
     with pytest.raises(AssertionError):
         runner.do_stages(job(tmp_path, "drq"))
+
+
+@pytest.mark.parametrize(("ibrl", "retrieves"), [(True, True), (False, False)])
+def test_a_run_that_lets_the_clone_compete_needs_data(tmp_path, ibrl, retrieves):
+    wpt = {**SECTIONS["wpt"], "offline_ratio": 0.0, "guidance": 0.0, "ibrl": ibrl}
+    assert job(tmp_path, "wpt", wpt=wpt).retrieves == retrieves
+    for method in ("scratch", "no-guidance", "dreamer-v3"):  # none of which has a clone
+        assert not job(tmp_path, method, wpt=wpt).full_keywords["ibrl"]

@@ -120,7 +120,8 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
     }
 
 
-ALONE = {"offline_ratio": 0.0, "guidance": 0.0, "kickstart": 0.0}  # no data beside the replay
+NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False}
+ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data beside the replay
 # DreamerV3 from scratch, by the settings of its code for images of DMControl. Left out are its
 # optimiser, norms and pooling, the spacing of its bins, and the critic's regulariser on replayed
 # states. Its returns bootstrap from the critic, ours from the target critic. The continue head
@@ -146,7 +147,7 @@ METHODS = {
     # Scratch has every addition that needs neither data nor a clone.
     "scratch": Method(keywords=ALONE, pretrained=False, needs_data=False, plus=True),
     "pretrain-only": Method(keywords=ALONE),
-    "no-guidance": Method(keywords={"guidance": 0.0, "kickstart": 0.0}),
+    "no-guidance": Method(keywords=NO_CLONE),
     "no-rehearsal": Method(keywords={"offline_ratio": 0.0}),
     "no-pretrain": Method(pretrained=False),
     "random-retrieval": Method(keywords={"retrieval": "random"}),

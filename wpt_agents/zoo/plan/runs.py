@@ -117,7 +117,7 @@ class Run:
         wpt = SimpleNamespace(**self.full_keywords)
         guided = ever(parse_schedule(wpt.guidance))
         imitates = ever(parse_schedule(wpt.kickstart, np.inf))
-        return bool(wpt.offline_ratio) or guided or imitates
+        return bool(wpt.offline_ratio) or guided or imitates or wpt.ibrl
 
     @property
     def updates(self) -> int | None:

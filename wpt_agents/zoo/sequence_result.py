@@ -26,7 +26,7 @@ class Row:
 
     :param task: the task that was learned
     :param scores: of this task and all before it, by task
-    :param updates: gradient updates for this task
+    :param updates: gradient updates for this task, and PackNet's retraining of the one before it
     :param seconds: wall-clock seconds of learning it
     :param cpu_seconds: processor seconds of learning it
     """

@@ -213,8 +213,7 @@ class DrQv2Learner:
         :param batch: with shifted images
         :param std: σ of the exploration schedule
         """
-        policy = self.policy
-        clip = self.settings.std_clip
+        policy, clip = self.policy, self.settings.std_clip
         embed = policy.encoder(batch.image)
         with torch.no_grad():  # the encoder has no target network: h' is of the present one
             next_embed = policy.encoder(batch.next_image)
@@ -265,8 +264,7 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
     def make_policy(self) -> DrQv2Policy:
         """Make the networks, as wide as the environment's actions."""
         widths = [getattr(self.hyperparameters, name) for name in self.shape_keywords]
-        spaces_ = self.observation_space, self.action_space
-        return DrQv2Policy(*spaces_, None, *widths)
+        return DrQv2Policy(self.observation_space, self.action_space, None, *widths)
 
     def make_learner(self) -> DrQv2Learner:
         """Make the optimisers."""

@@ -45,11 +45,12 @@ class Row:
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """Everything that a finished sequence found.
+    """Everything that a sequence has found so far.
 
+    :param tasks: all tasks, in the order of learning
     :param frames: simulator frames of each task
     :param steps: calls of `env.step` of each task
-    :param rows: one for each task, in the order of learning
+    :param rows: one for each task that is finished
     """
 
     suite: str
@@ -57,10 +58,16 @@ class SequenceResult:
     method: str
     variant: Variant
     seed: int
+    tasks: Sequence[str]
     frames: int
     steps: int
     rows: Sequence[Row]
     commit: str | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether all tasks are finished."""
+        return len(self.rows) == len(self.tasks)
 
     @property
     def command(self) -> str:
@@ -95,7 +102,7 @@ def write_sequence(folder: Path, result: SequenceResult) -> None:
 
 
 def read_sequence(folder: Path) -> SequenceResult | None:
-    """Read the result of the sequence in `folder`, None while it is not finished.
+    """Read the result of the sequence in `folder`, None before its first task is finished.
 
     :raises ValueError: the file is damaged
     """

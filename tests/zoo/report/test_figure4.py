@@ -14,10 +14,10 @@ TASKS = ("dmc-quadruped-stand", "dmc-quadruped-walk")
 
 
 def make_sequence(out, method, returns, seed=0, evaluated=True):
-    """Writes a finished sequence: returns[k][j] is the return on task j after task k."""
+    """Writes a sequence: returns[k][j] is the return on task j after task k."""
     folder = out / "tiny" / method / f"ant_{seed}"
     rows = []
-    for k, task in enumerate(TASKS):
+    for k, task in enumerate(TASKS[: len(returns)]):
         (folder / task).mkdir(parents=True)
         scores = {TASKS[j]: Score((value,)) for j, value in enumerate(returns[k])}
         rows.append(Row(task, scores, 5, 1.0, 1.0))
@@ -31,7 +31,9 @@ def make_sequence(out, method, returns, seed=0, evaluated=True):
             lines = ["#{}", "r,l,t", *(f"{value}.0,10,1" for value in range(25))]
             (folder / task / "0.monitor.csv").write_text("\n".join(lines), encoding="utf-8")
     (folder / "config.yaml").write_text("task: ant", encoding="utf-8")
-    result = SequenceResult("dmc", "ant", method, Variant("tiny"), seed, 400, 200, rows, "0123")
+    result = SequenceResult(
+        "dmc", "ant", method, Variant("tiny"), seed, list(TASKS), 400, 200, rows, "0123"
+    )
     write_sequence(folder, result)
     return result
 
@@ -73,6 +75,18 @@ def test_the_page_shows_the_figure_and_what_is_missing(sequences, monkeypatch, t
     make_sequence(other, "wpt", [[800.0], [100.0, 600.0]])
     write_page(other, other / "index.html")
     assert "Missing: packnet." in text((other / "index.html").read_text(encoding="utf-8"))
+
+
+def test_a_sequence_that_is_not_finished_is_shown_as_far_as_it_is(sequences):
+    make_sequence(sequences, "packnet", [[100.0]], seed=1)
+    [figure] = figures_4(find_sequences(sequences))
+    matrices = {matrix.name: matrix for matrix in figure.matrices}
+    assert matrices["packnet"].rows == [[200.0]] and len(figure.curves) == 2
+    assert matrices["packnet"].share == pytest.approx(200 / 700)  # on the first task
+    assert figure.missing == ["1 task of packnet, seed 1"]
+    write_page(sequences, sequences / "index.html")
+    words = text((sequences / "index.html").read_text(encoding="utf-8"))
+    assert "Missing: 1 task of packnet, seed 1." in words and "stopped, or still running" in words
 
 
 def test_a_folder_without_any_result_is_refused(monkeypatch, tmp_path, capsys):

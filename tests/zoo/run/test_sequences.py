@@ -87,6 +87,7 @@ def test_a_killed_sequence_ends_as_one_that_was_not(method, tmp_path, monkeypatc
             run_sequence(killed)
     assert read_row(killed.runs[0].folder) and not read_row(killed.runs[1].folder)
     assert list(killed.runs[1].folder.glob("checkpoints/step-*"))
+    assert len(read_sequence(killed.folder).rows) == 1
     assert returns(run_sequence(killed)) == returns(expected)
     one, other = tensors(whole.runs[1].folder), tensors(killed.runs[1].folder)
     assert one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wpt_agents.files.names import counted
 from wpt_agents.zoo.report import figures
 from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
@@ -52,7 +53,7 @@ class Figure4:
 
 
 def find_sequences(folder: Path) -> list[Finished]:
-    """Return every finished sequence below `folder`, in the order of their paths."""
+    """Return every sequence below `folder` with a finished task, in the order of their paths."""
     results = [(path.parent, read_sequence(path.parent)) for path in folder.glob(f"**/{FILE}")]
     return sorted((path, result) for path, result in results if result is not None)
 
@@ -70,38 +71,59 @@ def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finishe
     methods: dict[str, list[Finished]] = defaultdict(list)
     for path, result in finished:
         methods[result.method].append((path, result))
-    tasks = [row.task for row in finished[0][1].rows]
+    tasks = list(finished[0][1].tasks)
     curves = []
-    for task in tasks:
+    for place, task in enumerate(tasks):
+        runs_of = {
+            name: [(path, result) for path, result in runs if len(result.rows) > place]
+            for name, runs in methods.items()
+        }
         lines = [
-            curve(name, [_curve(*one, task) for one in runs]) for name, runs in methods.items()
+            curve(name, [_curve(*run, task) for run in runs])
+            for name, runs in runs_of.items()
+            if runs
         ]
-        curves.append(figures.lines(task, "simulator frames", "return", lines, list(methods)))
-    means = {name: float(np.mean(_learned(runs))) for name, runs in methods.items()}
-    ours = means.get("wpt")
+        if lines:
+            curves.append(figures.lines(task, "simulator frames", "return", lines, list(methods)))
     return Figure4(
         title=f"{sequence}, {variant}, {frames:,} frames a task",
         tasks=tasks,
         curves=curves,
         matrices=[
-            _matrix(name, runs, means[name] / ours if ours else None)
+            _matrix(name, runs, _share(runs, methods.get("wpt", ())))
             for name, runs in methods.items()
         ],
-        missing=[name for name in COMPARED if name not in methods],
+        missing=[*_missing(finished), *(name for name in COMPARED if name not in methods)],
     )
 
 
-def _learned(finished: Sequence[Finished]) -> np.ndarray:
-    """The returns on the task being learned: (seeds, tasks)."""
-    return np.array([[row.learned.mean for row in result.rows] for _, result in finished])
+def _missing(finished: Sequence[Finished]) -> list[str]:
+    """Say of each sequence that is not finished how many tasks it has."""
+    lines = []
+    for _, result in finished:
+        if left := len(result.tasks) - len(result.rows):
+            lines.append(f"{counted(left, 'task')} of {result.method}, seed {result.seed}")
+    return lines
+
+
+def _share(runs: Sequence[Finished], ours: Sequence[Finished]) -> float | None:
+    """Return the mean return while learning as a share of WPT's, on the tasks that both have."""
+    if not ours:
+        return None
+    common = min(len(result.rows) for _, result in [*runs, *ours])
+    theirs, wpt = (
+        np.mean([[row.learned.mean for row in result.rows[:common]] for _, result in some])
+        for some in (runs, ours)
+    )
+    return float(theirs / wpt) if wpt else None
 
 
 def _matrix(name: str, finished: Sequence[Finished], share: float | None) -> Matrix:
     results = [result for _, result in finished]
-    tasks = [row.task for row in results[0].rows]
+    tasks = results[0].tasks
     rows = [
         [float(np.mean([r.rows[k].scores[task].mean for r in results])) for task in tasks[: k + 1]]
-        for k in range(len(tasks))
+        for k in range(min(len(result.rows) for result in results))
     ]
     return Matrix(name, [result.seed for result in results], rows, results[0].command, share)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
-from wpt_agents.zoo import sequence_result
 from wpt_agents.zoo.report.aggregates import Experiment
 from wpt_agents.zoo.result import FILE, Result, read_result
+from wpt_agents.zoo.sequence_result import read_sequence
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,9 @@ def find_unfinished(folder: Path) -> list[Unfinished]:
     """Return every run folder below `folder` that has no result yet."""
     entries = []
     for path in sorted(folder.glob("**/config.yaml")):
-        if not any((path.parent / name).exists() for name in (FILE, sequence_result.FILE)):
+        sequence = read_sequence(path.parent)
+        finished = (path.parent / FILE).exists() or (sequence is not None and sequence.finished)
+        if not finished:
             error = path.parent / "error.txt"
             entries.append(
                 Unfinished(path.parent, error.read_text(encoding="utf-8") if error.exists() else "")

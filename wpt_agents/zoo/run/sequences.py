@@ -3,7 +3,7 @@
 Each task has a folder with the logs, checkpoints and model file of an ordinary run, and with
 `scores.json` once it is finished. An agent goes on to the next task from files alone, so a sequence
 that was killed continues as one that never stopped. The episodes of all tasks are kept until the
-sequence ends. `sequence.json` is written last.
+sequence ends. `sequence.json` holds the results of the tasks that are finished.
 """
 
 import shutil
@@ -79,7 +79,7 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
 def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
     """Do what is not done yet of a sequence and return its result."""
     done = None if force else read_sequence(job.folder)
-    if done is not None:
+    if done is not None and done.finished:
         say("sequence", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")
         return done
     with locked(job.folder / "lock"):
@@ -99,7 +99,8 @@ def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
 
 
 def _do_tasks(job: SequenceRun) -> SequenceResult:
-    rows = []
+    rows: list[Row] = []
+    result = _result(job, rows)
     for number, run in enumerate(job.runs):
         row = read_row(run.folder)
         if row is None:
@@ -107,23 +108,28 @@ def _do_tasks(job: SequenceRun) -> SequenceResult:
             write_row(run.folder, row)
             shutil.rmtree(run.folder / "checkpoints", ignore_errors=True)
         rows.append(row)
+        result = _result(job, rows)
+        write_sequence(job.folder, result)
         say("return", f"{row.learned.mean:.1f} on {row.task}")
+    for run in job.runs:
+        shutil.rmtree(run.folder / "replay", ignore_errors=True)
+    return result
+
+
+def _result(job: SequenceRun, rows: Sequence[Row]) -> SequenceResult:
     first = job.runs[0]
-    result = SequenceResult(
+    return SequenceResult(
         suite=first.task.suite,
         sequence=job.name,
         method=first.method,
         variant=first.variant,
         seed=first.seed,
+        tasks=[short_name(run.task) for run in job.runs],
         frames=first.preset.learn.frames,
         steps=first.preset.steps,
-        rows=rows,
+        rows=list(rows),
         commit=commit(),
     )
-    write_sequence(job.folder, result)
-    for run in job.runs:
-        shutil.rmtree(run.folder / "replay", ignore_errors=True)
-    return result
 
 
 def _learn_task(job: SequenceRun, number: int) -> Row:

@@ -56,7 +56,7 @@ def test_a_value_that_is_refused_says_why_and_changes_nothing(data, name, value,
     before = model.hyperparameters
     with pytest.raises(ValueError, match=message):
         setattr(model, name, value)
-    assert model.hyperparameters is before and getattr(model, name) == getattr(before, name)
+    assert model.hyperparameters is before and getattr(model, name) == before.value(name)
     assert model.learner.hyperparameters == before.resolved()
 
 

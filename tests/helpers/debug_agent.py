@@ -26,7 +26,7 @@ SETTINGS = {
 
 
 class ClockEnv(gym.Env):
-    """Every byte of the image is the time, and so is the reward; an episode lasts `length`."""
+    """Every byte of the image is the time, modulo 256, and the reward is the time."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
@@ -37,7 +37,7 @@ class ClockEnv(gym.Env):
         self.time = 0
 
     def render(self):
-        return np.full((64, 64, 3), self.time, np.uint8)
+        return np.full((64, 64, 3), self.time % 256, np.uint8)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

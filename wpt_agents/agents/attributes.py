@@ -76,6 +76,12 @@ class KeywordAgent(BaseAlgorithm):
 
         def __getattr__(self, name: str) -> Any: ...
 
+    def __repr__(self) -> str:
+        """The keywords that differ from their defaults, those that the size decides, and counts."""
+        chosen = ", ".join(f"{k}={v!r}" for k, v in self.hyperparameters.chosen().items())
+        counted = f"num_timesteps={self.num_timesteps}, updates={self.updates}"
+        return f"<{type(self).__name__}({chosen}), {counted}>"
+
     def change_hyperparameter(self, name: str, value: Any) -> None:
         """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
 

@@ -1,4 +1,4 @@
-"""The base of all agents: keywords, environments, collecting whole episodes, logging, model files.
+"""The base of all agents: keywords, environments, collecting episodes, logging, model files.
 
 A subclass provides its keywords, a policy, a learner and one update. For example::
 
@@ -26,6 +26,7 @@ from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -40,6 +41,7 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
+from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.rollout import Rollout, Window, last_images, step_all
 
@@ -47,7 +49,7 @@ Metrics = dict[str, list[Tensor]]
 
 
 class PixelAgent(SavedAgent):
-    """An algorithm that acts on images, learns from whole episodes and keeps SB3's verbs."""
+    """An algorithm that acts on images, learns from stored episodes and keeps SB3's verbs."""
 
     warmup_pays: ClassVar[bool] = False  # whether steps before `learning_starts` pay for updates
 
@@ -70,6 +72,11 @@ class PixelAgent(SavedAgent):
     def before_step(self) -> None:
         """Do what must come before each step that is collected, such as setting the noise."""
 
+    @property
+    def warmup_driver(self) -> str:
+        """Who drives the warm-up, in words."""
+        return "random actions"
+
     def guidance_window(self, rng: np.random.Generator) -> Window:
         """Return the steps (start, stop) of a new episode in which `guide` acts, not the policy."""
         return 0, 0
@@ -83,6 +90,14 @@ class PixelAgent(SavedAgent):
 
     def on_episode(self, trajectory: Trajectory) -> None:
         """Look at a finished episode before it is added to the replay buffer."""
+
+    def steps_per_update(self) -> float:
+        """Return how many collected steps pay for the first update."""
+        return 1 / self.updates_per_step
+
+    def cheaper_updates(self, steps: int) -> str:
+        """Return the assignment by which `steps` collected steps pay for an update, "" for none."""
+        return ""
 
     # Learning
 
@@ -99,7 +114,7 @@ class PixelAgent(SavedAgent):
 
         :param total_timesteps: calls of `env.step`, a lower bound
         :param callback: SB3's callbacks
-        :param log_interval: episodes between two dumps of the log
+        :param log_interval: stored episodes between two dumps of the log
         :return: the agent itself
         """
         with self.learning(
@@ -125,6 +140,14 @@ class PixelAgent(SavedAgent):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if self.verbose:
+            print(self)
+        made = self.updates
+        # What earlier steps paid for is kept, so that short calls in a row learn, too.
+        begun = self.num_timesteps >= self.learning_starts and len(self.replay_buffer) > 0
+        continued = begun and not reset_num_timesteps
+        outlook = Outlook.of(self)
+        outlook.warn(over=False, learns=continued)
         callback.on_training_start(locals(), globals())
         try:
             yield callback
@@ -133,6 +156,8 @@ class PixelAgent(SavedAgent):
             raise
         finally:
             callback.on_training_end()
+        outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
+        outlook.warn(over=True, learns=continued or self.updates > made)
 
     @property
     def unfinished(self) -> bool:
@@ -140,7 +165,10 @@ class PixelAgent(SavedAgent):
         return self.num_timesteps < self._total_timesteps
 
     def collect(self, callback: BaseCallback, log_interval: int | None) -> bool:
-        """Step all environments until an episode ends; return False when a callback says stop."""
+        """Step all environments until an episode ends, or has become so long that it is stored.
+
+        :return: False when a callback says stop
+        """
         assert self.env is not None
         rollout = self._open_rollout()
         callback.on_rollout_start()
@@ -154,27 +182,35 @@ class PixelAgent(SavedAgent):
             new_obs, rewards, dones, infos = step_all(self.env, action, meanwhile)
             check_rewards(rewards, self.num_timesteps)  # before anything of this step is recorded
             self.num_timesteps += self.n_envs
-            if self.warmup_pays or self.num_timesteps > self.hyperparameters.learning_starts:
+            if self.warmup_pays or self.num_timesteps > self.learning_starts:
                 self.credit += self.n_envs
-            last = last_images(self.env, infos, dones, new_obs)
+            full = rollout.full(dones, self.max_trajectory_length)
+            last = last_images(self.env, infos, dones, new_obs, full)
             finished = rollout.end_step(rewards, dones, last)
-            self._store(finished)  # before the callback, which may save the replay buffer
+            self._store(finished, int(full.sum()))  # before the callback, which may save the replay
             callback.update_locals(locals())
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             self._log_episodes(log_interval, len(finished))
             self._last_obs = new_obs
             self._last_episode_starts = dones
-            ended = bool(dones.any())
+            ended = bool(finished)
         if go_on:
             callback.on_rollout_end()
         return go_on
+
+    def time_limit(self) -> int | None:
+        """Return the steps after which the environment ends an episode, if it says so."""
+        assert self.env is not None
+        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+        return getattr(spec, "max_episode_steps", None)
 
     def first_image(self) -> np.ndarray:
         """Return the first image of the first environment's open episode, (1, 64, 64, 3)."""
         frame = to_images(self._last_obs)[0][0]
         if self.rollout is not None and not self._last_episode_starts.all():
-            frame = next(iter(self.rollout.images[0]), frame)
+            opening = self.rollout.first_image(0)
+            frame = frame if opening is None else opening
         return np.asarray(frame)[None]
 
     def _open_rollout(self) -> Rollout:
@@ -186,24 +222,28 @@ class PixelAgent(SavedAgent):
                 self.action_space.shape[0],
                 self._draw_window,
                 self.guide,
-                self.streams.torch(Purpose.ACT, self.episodes, self.device),
+                self.streams.torch(Purpose.ACT, self.episodes + self.progress.cut, self.device),
                 self.hyperparameters.embodiment,
             )
         return self.rollout
 
     def _draw_window(self) -> Window:
         """Decide at an episode's start whether, and when, the guide acts."""
-        if self.num_timesteps < self.hyperparameters.warmup_steps:
+        if self.num_timesteps < self.warmup_steps:
             return 0, sys.maxsize  # the whole episode, however long it lasts
         self.progress.windows_drawn += 1
         return self.guidance_window(self.streams.numpy(Purpose.WINDOW, self.progress.windows_drawn))
 
-    def _store(self, finished: list[Trajectory]) -> None:
+    def _store(self, finished: list[Trajectory], cut: int) -> None:
+        """Store completed trajectories, of which `cut` are of episodes that go on."""
         for trajectory in finished:
             self.on_episode(trajectory)
             self.replay_buffer.add(trajectory)
             self.progress.seen_length = max(self.progress.seen_length or 0, len(trajectory))
-        self.episodes += len(finished)
+            if cut and trajectory.reward is not None:  # SB3's means are of ended episodes alone
+                self.logger.record_mean("rollout/reward_per_step", trajectory.reward.mean())
+        self.episodes += len(finished) - cut
+        self.progress.cut += cut
 
     def updates_due(self) -> int:
         """Return how many updates the collected steps have paid for."""
@@ -213,7 +253,7 @@ class PixelAgent(SavedAgent):
         """Make the updates that are due, and log their means."""
         if not self.replay_buffer.trajectories or not self.updates_per_step:
             return
-        if self.num_timesteps < self.hyperparameters.learning_starts:
+        if self.num_timesteps < self.learning_starts:
             return
         updates = self.updates_due()
         price = 1 / self.updates_per_step
@@ -226,8 +266,8 @@ class PixelAgent(SavedAgent):
             self.logger.record_mean(key, torch.stack(values).mean().item())
 
     def _log_episodes(self, log_interval: int | None, new: int) -> None:
-        before = self.episodes - new
-        if not log_interval or before // log_interval == self.episodes // log_interval:
+        stored = self.episodes + self.progress.cut
+        if not log_interval or (stored - new) // log_interval == stored // log_interval:
             return
         assert self.ep_info_buffer is not None and self.ep_success_buffer is not None
         record = self.logger.record

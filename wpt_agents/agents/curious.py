@@ -156,7 +156,8 @@ class Explorer(WPT):
         """Collect until there are `episodes`, learning after each; yield each with its rewards.
 
         An episode is a function of the seed and of the replay buffer, so that an explorer that was
-        loaded and whose episodes were added continues as if it had never stopped.
+        loaded and whose episodes were added continues as if it had never stopped. One that reaches
+        `max_trajectory_length` steps ends there.
         """
         assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
         _, callback = self._setup_learn(
@@ -173,6 +174,8 @@ class Explorer(WPT):
             self.rollout = None  # no half-played episode
             with self.operations():
                 self.collect(callback, 0)
+                self.episodes += self.progress.cut  # the environment is reset here, too
+                self.progress.cut = 0
                 self.update_models()
             yield self.replay_buffer.trajectories[-1]
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from wpt_agents.agents.base import PixelAgent
+from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
 from wpt_agents.data.related import related_trajectories
 from wpt_agents.data.replay import ReplayBuffer
@@ -48,7 +49,7 @@ class FrameKeywords(Keywords):
         "trajectories of this task, or else of the robot `embodiment`",
         Stage.RETRIEVAL,
     )
-    num_retrieve: int = count(500, "offline trajectories to use at most", Stage.RETRIEVAL)
+    num_retrieve: int | None = count(500, "offline trajectories to use at most", Stage.RETRIEVAL)
     learning_starts: int = count(
         2_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )
@@ -131,6 +132,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         """Whether offline data are used at all."""
         return False
 
+    def cheaper_updates(self, steps: int) -> str:
+        """Return the assignment by which `steps` collected steps pay for an update."""
+        return f"model.update_every = {max(steps, 1)}"
+
     def prepare(self, progress_bar: bool) -> None:
         """Choose and read the offline data, if any are used."""
         if not self.wants_data or self.retrieved is not None:
@@ -144,7 +149,8 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             self.progress.retrieved_ids = self._related()
             self.progress.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
-        for trajectory in self.dataset.subset(self.progress.retrieved_ids):
+        chosen = self.dataset.subset(self.progress.retrieved_ids)
+        for trajectory in shown(chosen, len(chosen), "retrieve", progress_bar):
             if self.offline_rewards and trajectory.reward is None:
                 self.retrieved = None
                 raise ValueError(
@@ -164,7 +170,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             task,
             settings.embodiment,
             self.policy.action_dim,
-            settings.num_retrieve,
+            settings.value("num_retrieve"),
             self.streams.numpy(Purpose.RETRIEVE, 0),
         )
 

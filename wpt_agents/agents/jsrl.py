@@ -4,7 +4,9 @@ Source: https://arxiv.org/abs/2204.02372 with random horizons, as in appendix G 
 version of the WPT paper: the clone drives the first h steps of an episode, h in {0, 10, .., 100}.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,9 +24,27 @@ HORIZONS = np.arange(0, 101, 10)  # steps that the clone drives, each equally li
 class JSRLKeywords(DrQv2Keywords):
     """The keywords of `JSRL`."""
 
+    sizes_own: ClassVar[Mapping[str, str]] = {
+        name: name for name in ("num_retrieve", "bc_steps", "bc_batch_size")
+    }
+    size_keyword: ClassVar[str] = "bc_size"
+
     bc_size: str = choice("medium", SIZES, "widths of the clone, a size of WPT", Stage.SIZE)
-    bc_steps: int = count(150_000, "updates of the clone", Stage.CLONING)
-    bc_batch_size: int = count(256, "images and actions in each", Stage.CLONING)
+    num_retrieve: int | None = count(
+        None,
+        "offline trajectories to use at most; those of `bc_size` if None, 500 for `medium`",
+        Stage.RETRIEVAL,
+    )
+    bc_steps: int | None = count(
+        None,
+        "updates of the clone; those of `bc_size` if None, 150,000 for `medium`",
+        Stage.CLONING,
+    )
+    bc_batch_size: int | None = count(
+        None,
+        "images and actions in each; those of `bc_size` if None, 256 for `medium`",
+        Stage.CLONING,
+    )
     bc_learning_rate: float = amount(
         1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
     )
@@ -72,7 +92,9 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         if self.retrieved is None or self.progress.cloned:
             return
         settings = self.hyperparameters
-        cloning = Cloning(settings.bc_steps, settings.bc_batch_size, settings.bc_learning_rate)
+        cloning = Cloning(
+            settings.value("bc_steps"), settings.value("bc_batch_size"), settings.bc_learning_rate
+        )
         trained = clone(
             self.policy.prior_actor,
             self.retrieved.trajectories,

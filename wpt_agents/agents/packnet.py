@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
 from wpt_agents.agents.drqv2 import Critic, DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
 from wpt_agents.agents.frame_agent import FrameProgress
+from wpt_agents.data.bars import shown
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.model.frames import orthogonal
 from wpt_agents.training.keywords import Stage, count, share
@@ -243,5 +243,5 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self.learner = self._learner_of(self.progress.task)
         made = self.updates - self.progress.updates_before
         updates = round(made * self.hyperparameters.retrain)
-        for _ in tqdm(range(updates), desc="retrain", disable=not progress_bar):
+        for _ in shown(range(updates), updates, "retrain", progress_bar):
             self.update(defaultdict(list))

@@ -5,7 +5,6 @@ words. DrQ-v2's actor and critic learn on the frozen features, as in https://arx
 """
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -16,10 +15,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor, nn
 from torch.optim import Adam
-from tqdm.auto import tqdm
 
 from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
 from wpt_agents.agents.frame_agent import FrameProgress
+from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.model_file import read_model
@@ -35,11 +34,11 @@ from wpt_agents.model.time_contrastive import (
 )
 from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, choice, count
+from wpt_agents.training.pretraining import Callback, Pretraining
 from wpt_agents.training.randomness import Purpose
 
 BACKBONES = ("conv", "resnet18", "resnet34", "resnet50")
 NEGATIVES = 3  # other clips that each clip is contrasted with
-EVERY = 1_000  # pre-training updates between two model files
 
 
 class FrameFeatures(nn.Module):
@@ -206,7 +205,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         run_dir: str | os.PathLike[str] | None = None,
         seed: int | None = None,
         progress_bar: bool = False,
-        callback: Callable[[int, dict[str, float]], Any] | None = None,
+        callback: Callback | None = None,
         accumulate: int = 1,
         **kwargs: Any,
     ) -> Self:
@@ -215,8 +214,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         :param dataset: whatever `open_dataset` takes
         :param env: the environment to continue with, if known
         :param steps: updates
-        :param run_dir: folder of `model.zip`, which is written every 1,000 updates and at the end;
-            if it is there already, training continues from it
+        :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
+            on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
+            If a model is there, training continues from it
         :param callback: called after every update with (step, metrics)
         :param accumulate: must be 1; `WPT.pretrain` has it, too
         :param kwargs: keywords of `R3M`
@@ -226,31 +226,22 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         cls.check_keywords(kwargs)
         model = cls(seed=seed, **kwargs)
         model.set_dataset(dataset)
-        path = Path(run_dir) / "model.zip" if run_dir is not None else None
-        if path is not None and path.exists():
-            model.restore(*read_model(path), (*cls.shape_keywords, "clips"))
-        model._pretrain(steps, path, progress_bar, callback)
+        folder = Path(run_dir) if run_dir is not None else None
+        if folder is not None and (folder / "model.zip").exists():
+            model.restore(*read_model(folder / "model.zip"), (*cls.shape_keywords, "clips"))
+        with Pretraining(model, steps, folder, callback) as run:
+            model._pretrain(steps, run, progress_bar)
         if env is not None:
             model.set_env(env)
         return model
 
-    def _pretrain(
-        self,
-        steps: int,
-        path: Path | None,
-        progress_bar: bool,
-        callback: Callable[[int, dict[str, float]], Any] | None,
-    ) -> None:
+    def _pretrain(self, steps: int, run: Pretraining, progress_bar: bool) -> None:
         assert self.dataset is not None
         trajectories = list(self.dataset)
         done = self.progress.pretrain_steps
-        for step in tqdm(range(done, steps), desc="pre-train", disable=not progress_bar):
+        for step in shown(range(done, steps), steps, "pre-train", progress_bar, done):
             rng = self.streams.numpy(Purpose.PRETRAIN, step)
             clips = draw_clips(trajectories, self.hyperparameters.clips, rng)
             others = derangements(len(clips), NEGATIVES, rng).to(self.device)
-            metrics = self.learner.pretrain(random_crop(clips, rng).to(self.device), others)
-            self.progress.pretrain_steps = step + 1
-            if callback is not None:
-                callback(step + 1, {name: float(value) for name, value in metrics.items()})
-            if path is not None and ((step + 1) % EVERY == 0 or step + 1 == steps):
-                self.save(path)
+            clips = random_crop(clips, rng).to(self.device)
+            run.finish_update(self.learner.pretrain(clips, others))

@@ -207,7 +207,7 @@ class SavedAgent(KeywordAgent):
         """Return what a model file says of this agent besides its tensors."""
         return {
             "class": self.saved_as or type(self).__name__,
-            "hyperparameters": self.hyperparameters.as_dict(),
+            "hyperparameters": self.hyperparameters.resolved().as_dict(),
             "action_space": space_as_dict(self.action_space),
             "counters": self.progress.as_dict(),
         }
@@ -261,7 +261,7 @@ class SavedAgent(KeywordAgent):
 
         :param same: keywords that must be equal here and in the file
         """
-        model_files.check_same(header, self.hyperparameters.as_dict(), same)
+        self._check_same(header, same)
         progress = self.progress_class.of(header["counters"])
         self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
@@ -272,6 +272,12 @@ class SavedAgent(KeywordAgent):
 
         :param weights: by name; none of a file that holds a world model alone
         """
+
+    def _check_same(self, header: Mapping[str, Any], names: tuple[str, ...]) -> None:
+        trained_with = self.keywords.of(
+            header["hyperparameters"]
+        )  # of a `Size` it fills new fields
+        model_files.check_same(trained_with.as_dict(), self.hyperparameters.as_dict(), names)
 
     def set_parameters(
         self,
@@ -285,7 +291,7 @@ class SavedAgent(KeywordAgent):
             super().set_parameters(load_path_or_dict, exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
-        model_files.check_same(header, self.hyperparameters.as_dict(), self.shape_keywords)
+        self._check_same(header, self.shape_keywords)
         self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
 

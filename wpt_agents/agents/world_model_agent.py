@@ -155,14 +155,21 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         settings = self.hyperparameters
         return settings.train_ratio / (settings.batch_size * settings.batch_length)
 
+    def cheaper_updates(self, steps: int) -> str:
+        """Return the assignment by which `steps` collected steps pay for an update."""
+        settings = self.hyperparameters
+        ratio = math.ceil(settings.batch_size * settings.batch_length / max(steps, 1))
+        return f"model.train_ratio = {ratio}"
+
     def expected_length(self) -> int:
-        """Return an episode's steps: the keyword, the longest so far, the environment's, or 500."""
-        if length := self.hyperparameters.episode_length or self.progress.seen_length:
-            return length
-        assert self.env is not None
-        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
+        """Return a trajectory's steps: the keyword, the longest so far, the environment's, or 500.
+
+        Of an episode that is cut, each part has a guidance window of its own.
+        """
+        known = self.hyperparameters.episode_length or self.progress.seen_length
         # 500 calls of `env.step` are an episode of DMControl at action repeat 2.
-        return getattr(spec, "max_episode_steps", None) or 500
+        length = known or self.time_limit() or 500
+        return min(length, self.hyperparameters.max_trajectory_length)
 
     def on_episode(self, trajectory: Trajectory) -> None:
         """Log how well the world model predicts an episode that it has not replayed yet."""
@@ -190,7 +197,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     @property
     def begun(self) -> bool:
         """Whether anything was done for a task."""
-        return self.progress.episodes > 0
+        return self.progress.episodes + self.progress.cut > 0
 
     def reset_task(self) -> None:
         """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.

@@ -20,12 +20,13 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from wpt_agents.agents.base import Metrics
 from wpt_agents.agents.world_model_agent import WorldModelAgent
+from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
-from wpt_agents.model.sizes import Size
+from wpt_agents.model.sizes import Size, find_size
 from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.distributed import joined, local_device
@@ -76,7 +77,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         cls,
         dataset: Data,
         env: GymEnv | str | None = None,
-        steps: int = 200_000,
+        steps: int | None = None,
         size: str | Size | Mapping[str, Any] = "paper",
         run_dir: str | os.PathLike[str] | None = None,
         seed: int | None = None,
@@ -94,12 +95,14 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
             whatever `open_dataset` takes
         :param env: the environment to continue with, if known
-        :param steps: updates
-        :param run_dir: `model.zip` is written there every 1000 steps and at the end; if it exists,
-            training continues from it, on any number of processes
+        :param steps: updates in all; the size's own if None, which is 200,000 for `paper`
+        :param run_dir: folder of `model.zip`, which is written every 1000 steps, at the end, and on
+            Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events. If
+            a model is there, training continues from it, on any number of processes
         :param callback: called after every update with (step, metrics)
         :param accumulate: passes over a batch, or a process's share of it, to save memory
-        :param kwargs: keywords of `WPT`; `batch_size` is that of all processes and passes together
+        :param kwargs: keywords of `WPT`, also `tensorboard_log`; `batch_size` is that of all
+            processes and passes together
         :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
             with other images or wider actions; an unknown keyword; a batch that cannot be divided
         """
@@ -110,12 +113,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             model = cls(size=size, seed=seed, device=device, **kwargs)
             with world.rank_0_first():
                 model.set_dataset(dataset)
-            path = Path(run_dir) / "model.zip" if run_dir is not None else None
-            if path is not None and path.exists():
+            folder = Path(run_dir) if run_dir is not None else None
+            if folder is not None and (folder / "model.zip").exists():
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
-                model.restore(*read_model(path), same)
+                model.restore(*read_model(folder / "model.zip"), same)
+            steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
             with model.operations():
-                pretraining.pretrain(model, world, steps, accumulate, path, progress_bar, callback)
+                pretraining.pretrain(
+                    model, world, steps, accumulate, folder, progress_bar, callback
+                )
         if env is not None:
             model.set_env(env)
         return model
@@ -174,7 +180,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             progress.retrieved_of = self.dataset.fingerprint
         retrieved = ReplayBuffer()
         numbers = progress.retrieved_ids
-        for trajectory in read_retrieved(self.dataset, kept, numbers, self.action_space):
+        read = read_retrieved(self.dataset, kept, numbers, self.action_space)
+        for trajectory in shown(read, len(numbers), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
         self.retrieved = retrieved
 
@@ -188,8 +195,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.retrieved.trajectories,
             self.policy.action_mask,
             Cloning(
-                settings.bc_steps,
-                settings.bc_batch_size,
+                settings.value("bc_steps"),
+                settings.value("bc_batch_size"),
                 settings.bc_learning_rate,
                 settings.grad_clip,
             ),
@@ -208,11 +215,22 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         guided = self.hyperparameters.guidance_at(self.num_timesteps)
         return draw_window(guided if self.progress.cloned else 0.0, self.expected_length(), rng)
 
+    @property
+    def warmup_driver(self) -> str:
+        """Who drives the warm-up, in words."""
+        guided = self.progress.cloned or (self.dataset and self.hyperparameters.needs_clone)
+        return "the prior actor's actions" if guided else super().warmup_driver
+
     def guide(self, frames: np.ndarray) -> np.ndarray:
         """Act as the prior actor; at random in the warm-up if there is none."""
         return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)
 
     # // Update Models
+
+    def steps_per_update(self) -> float:
+        """Return how many collected steps pay for the first update; a head start costs none."""
+        pending = self.hyperparameters.actor_delay > self.progress.task_updates
+        return 0.0 if pending else super().steps_per_update()
 
     def updates_due(self) -> int:
         """Return how many updates to make now: those that are paid for, or the head start."""
@@ -271,7 +289,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     @property
     def begun(self) -> bool:
         """Whether anything was done for a task."""
-        return self.progress.episodes > 0 or bool(self.progress.retrieved_ids)
+        return super().begun or bool(self.progress.retrieved_ids)
 
     def reset_task(self, keep_data: bool = False) -> None:
         """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.

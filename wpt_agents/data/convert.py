@@ -7,7 +7,6 @@ This module stands above `TrajectoryDataset` and fills its doors in (`Trajectory
 import hashlib
 import os
 import shutil
-import sys
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer as SB3Buffer
 from stable_baselines3.common.vec_env import VecEnv
 
+from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import Source, TrajectoryDataset
 from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.formats import FORMATS, NAMES, open_episodes, recognise
@@ -143,8 +143,6 @@ def from_episodes(
     :raises ValueError: the dataset there does not begin with these episodes, or an episode cannot
         be converted; those before it are kept
     """
-    from tqdm.auto import tqdm
-
     dataset = TrajectoryDataset.open_or_create(path, episodes.image_size)
     done = dataset.appended
     known = done > 0 and len(dataset) == done  # otherwise the last one may be set aside
@@ -153,14 +151,7 @@ def from_episodes(
             f"{path} holds {done} trajectories of another source or with other labels; "
             "convert to another folder"
         )
-    bar = tqdm(
-        total=len(episodes),
-        initial=done,
-        desc="convert",
-        unit=" episodes",
-        mininterval=0.2 if sys.stderr.isatty() else 10,  # a log file needs fewer lines
-        disable=not progress_bar or done == len(episodes),
-    )
+    bar = StageBar(len(episodes), "convert", progress_bar, done, " episodes")
     ranges = Ranges()
     with dataset, bar:
         for i in range(done, len(episodes)):

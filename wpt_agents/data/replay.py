@@ -1,4 +1,4 @@
-"""D_on and D_retrieval: whole episodes in memory, and `mix`, experience rehearsal's batch of both.
+"""D_on and D_retrieval: trajectories in memory, and `mix`, experience rehearsal's batch of both.
 
 Example::
 
@@ -21,9 +21,9 @@ LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 
 
 class ReplayBuffer:
-    """Whole episodes in memory, without a capacity limit.
+    """Episodes, and parts of long ones, in memory, without a capacity limit.
 
-    :ivar trajectories: the episodes in the order of addition; change it through `add` only
+    :ivar trajectories: they, in the order of addition; change it through `add` only
     """
 
     def __init__(self) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch  # noqa: F401  # before faiss: the other way round crashes on some builds
 
+from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import load_arrays, save_arrays
 
@@ -59,10 +60,8 @@ class Retriever:
 
         :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
         """
-        from tqdm.auto import tqdm
-
         features, at = np.zeros((len(dataset), 0), np.float32), 0
-        with tqdm(total=len(dataset), desc="index", disable=not progress_bar) as bar:
+        with StageBar(len(dataset), "index", progress_bar) as bar:
             for image in dataset.first_observations():
                 feature = np.asarray(embed(image), np.float32)
                 assert feature.ndim == 2 and len(feature) == len(image), (

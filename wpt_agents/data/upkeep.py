@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
+from wpt_agents.data.bars import StageBar
 from wpt_agents.data.codecs import find_codec
 from wpt_agents.data.folder import Folder
 from wpt_agents.data.index import Entry, read_damaged
@@ -60,10 +61,8 @@ def find_damage(
     :param check: reads a trajectory; what is wrong with it, or None
     :param apply: `map`, or a thread pool's
     """
-    from tqdm.auto import tqdm
-
     damaged = []
-    with tqdm(total=count, desc="validate", disable=not progress_bar) as bar:
+    with StageBar(count, "validate", progress_bar) as bar:
         for at in range(0, count, 256):  # in chunks, so that a thread pool does not queue them all
             chunk = range(at, min(at + 256, count))
             for i, reason in zip(chunk, apply(check, chunk), strict=True):

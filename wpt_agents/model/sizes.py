@@ -13,7 +13,9 @@ GATES = ("within", "across")
 
 @dataclass(frozen=True)
 class Size:
-    """The widths of all networks and the learning rates that suit them.
+    """The widths of all networks, and the learning rates and budgets that suit them.
+
+    The defaults of rates and budgets are Table 2's, so a `Size` of new widths has those.
 
     :param deter: width of h
     :param hidden: width of the layers inside the RSSM
@@ -29,6 +31,13 @@ class Size:
         "across" the blocks, as the weights that the paper's authors publish
     :param norm_eps: eps of every layer norm except those over a convolution's channels (1e-3)
     :param imagine_starts: states that dreams start from in an update; 0 for all of them
+    :param pretrain_steps: updates of the world model in pre-training
+    :param num_retrieve: trajectories to retrieve for a task
+    :param bc_steps: updates of the prior actor
+    :param bc_batch_size: images and actions in an update of the prior actor
+    :param learning_starts: steps that are collected before the first update
+    :param warmup_steps: steps that the prior actor alone drives
+    :param guidance: schedule of the probability that an episode is guided
     """
 
     deter: int
@@ -44,6 +53,13 @@ class Size:
     gates: str = "within"
     norm_eps: float = NORM_EPS
     imagine_starts: int = 0
+    pretrain_steps: int = 200_000  # Table 2, as all that follow
+    num_retrieve: int = 500
+    bc_steps: int = 150_000
+    bc_batch_size: int = 256
+    learning_starts: int = 5_000
+    warmup_steps: int = 7_500
+    guidance: str | float = "linear(1,0,50000)"
 
     def __post_init__(self) -> None:
         for name in ("deter", "hidden", "stoch", "classes", "depth", "units", "blocks"):
@@ -54,6 +70,11 @@ class Size:
             value = getattr(self, name)
             if value * factor % self.blocks:
                 raise ValueError(f"Size.{name}={value} cannot be divided into {self.blocks} blocks")
+        steps = self.pretrain_steps
+        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+            raise ValueError(
+                f"Size.pretrain_steps must be a whole number of at least 1, got {steps!r}"
+            )
         if self.gates not in GATES:
             raise unknown_name("gate layout", self.gates, GATES)
         for name in ("norm_eps", "learning_rate", "actor_critic_learning_rate"):
@@ -64,14 +85,48 @@ class Size:
 
 # `paper`: Table 2 prints 12288 as hidden and 1536 as deterministic. Only the other way round does
 # the world model have the 280 M parameters of the text (tests/model/test_world_model.py counts).
-# The others are ours: small enough for a CPU, with learning rates that grow as widths shrink.
+# The others are ours: small enough for a CPU, with learning rates that grow as widths shrink, and
+# with budgets in proportion. The budgets are those of the presets in zoo/*.yaml, rounded.
 SIZES = {
+    "debug": Size(
+        *(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
+        pretrain_steps=200,
+        num_retrieve=5,
+        bc_steps=200,
+        bc_batch_size=32,
+        learning_starts=200,
+        warmup_steps=200,
+        guidance="linear(1,0,1000)",
+    ),
+    "tiny": Size(
+        *(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
+        pretrain_steps=2_500,
+        num_retrieve=20,
+        bc_steps=2_000,
+        bc_batch_size=64,
+        learning_starts=500,
+        warmup_steps=500,
+        guidance="linear(1,0,4000)",
+    ),
     # `mid` has more groups of z and a wider h, in proportion, as DreamerV3's smallest preset does.
-    "debug": Size(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
-    "tiny": Size(128, 64, 8, 8, 8, 128, 1e-3, 4e-4),
-    "mid": Size(512, 128, 32, 8, 16, 256, 6e-4, 3e-4, imagine_starts=128),
-    "small": Size(256, 128, 16, 16, 16, 256, 6e-4, 3e-4),
-    "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4),
+    "mid": Size(
+        *(512, 128, 32, 8, 16, 256, 6e-4, 3e-4),
+        imagine_starts=128,
+        pretrain_steps=7_000,
+        num_retrieve=40,
+        bc_steps=4_000,
+        bc_batch_size=64,
+        learning_starts=1_000,
+        warmup_steps=1_000,
+        guidance="linear(1,0.1,12000)",
+    ),
+    "small": Size(
+        *(256, 128, 16, 16, 16, 256, 6e-4, 3e-4),
+        pretrain_steps=20_000,
+        num_retrieve=200,
+        bc_steps=20_000,
+    ),
+    "medium": Size(1024, 512, 32, 32, 32, 512, 2e-4, 1e-4, pretrain_steps=100_000),
     "paper": Size(12288, 1536, 32, 96, 96, 512, 1e-4, 8e-5, stabilised=False),
 }
 

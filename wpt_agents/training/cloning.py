@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LinearLR
-from tqdm.auto import tqdm
 
+from wpt_agents.data.bars import shown
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.behavior_cloning import PriorActor, bc_loss, draw_pairs, random_shift
 from wpt_agents.training.descent import descend
@@ -53,7 +53,7 @@ def clone(
     # At a constant rate the last noisy step is kept. The fall to 0 raised the success of 8 clones
     # of Meta-World tasks from 51 to 86 %.
     falling = LinearLR(optimizer, 1.0, 0.0, settings.steps)
-    for step in tqdm(range(settings.steps), desc="clone", disable=not progress_bar):
+    for step in shown(range(settings.steps), settings.steps, "clone", progress_bar):
         rng = streams.numpy(Purpose.CLONE, step)
         pairs = draw_pairs(trajectories, settings.batch_size, len(action_mask), rng)
         image, action = (tensor.to(device) for tensor in pairs)

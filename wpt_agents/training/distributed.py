@@ -57,6 +57,14 @@ class World:
             dist.all_reduce(value)
         return value
 
+    def largest(self, value: int, device: torch.device) -> int:
+        """Return the largest of the processes' values."""
+        if self.size == 1:
+            return value
+        largest = torch.tensor(value, device=device)
+        dist.all_reduce(largest, dist.ReduceOp.MAX)
+        return int(largest)
+
     def barrier(self) -> None:
         """Wait until every process is here."""
         if self.size > 1:

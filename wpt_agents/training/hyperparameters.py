@@ -6,7 +6,7 @@ its documentation, its checks and the zoo's list of what pre-training depends on
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,6 +34,12 @@ SIZES_OWN = {  # keywords that are the size's own if None, and the fields of `Si
     "imagine_starts": "imagine_starts",
     "zero_init_heads": "stabilised",
     "return_norm": "stabilised",
+    "learning_starts": "learning_starts",
+    "warmup_steps": "warmup_steps",
+    "guidance": "guidance",
+    "num_retrieve": "num_retrieve",
+    "bc_steps": "bc_steps",
+    "bc_batch_size": "bc_batch_size",
 }
 
 
@@ -45,6 +51,8 @@ def check_size(name: str, value: Any) -> None:
 @dataclass(frozen=True, kw_only=True)
 class Hyperparameters(Keywords):
     """The keywords of WPT. Steps are calls of `env.step` (2 frames each at action repeat 2)."""
+
+    sizes_own: ClassVar[Mapping[str, str]] = SIZES_OWN
 
     # The networks.
     size: str | Size | Mapping[str, Any] = keyword(  # noqa: RUF009  # a field, as the others are
@@ -219,22 +227,25 @@ class Hyperparameters(Keywords):
     )
 
     # Collecting.
-    learning_starts: int = count(
-        5_000,
-        "steps that are collected before the first update; they earn updates, too",
+    learning_starts: int | None = count(
+        None,
+        "steps that are collected before the first update; they earn updates, too; the size's own "
+        "if None, which is 5,000 for `paper`",
         Stage.ACTING,
         least=0,
     )
-    warmup_steps: int = count(
-        7_500,
-        "steps that the prior actor alone drives (uniform random actions without one)",
+    warmup_steps: int | None = count(
+        None,
+        "steps that the prior actor alone drives (uniform random actions without one); the size's "
+        "own if None, which is 7,500 for `paper`",
         Stage.ACTING,
         least=0,
     )
-    guidance: str | float = schedule(
-        "linear(1,0,50000)",
+    guidance: str | float | None = schedule(
+        None,
         1.0,
-        "schedule of the probability that an episode is guided; 0: no guidance",
+        "schedule of the probability that an episode is guided; 0: no guidance; the size's own if "
+        "None, which is 'linear(1,0,50000)' for `paper`",
         Stage.ACTING,
     )
     ibrl: bool = switch(
@@ -258,16 +269,27 @@ class Hyperparameters(Keywords):
     )
 
     # Retrieval and the prior actor.
-    num_retrieve: int = count(500, "R, trajectories to retrieve", Stage.RETRIEVAL)
+    num_retrieve: int | None = count(
+        None,
+        "R, trajectories to retrieve; the size's own if None, which is 500 for `paper`",
+        Stage.RETRIEVAL,
+    )
     retrieval: str = choice(
         "nearest",
         ("nearest", "random"),
         '"nearest", by Eq. (5), or "random", its ablation',
         Stage.RETRIEVAL,
     )
-    bc_steps: int = count(150_000, "updates of the prior actor", Stage.CLONING)
-    bc_batch_size: int = count(
-        256, "images and actions in an update of the prior actor", Stage.CLONING
+    bc_steps: int | None = count(
+        None,
+        "updates of the prior actor; the size's own if None, which is 150,000 for `paper`",
+        Stage.CLONING,
+    )
+    bc_batch_size: int | None = count(
+        None,
+        "images and actions in an update of the prior actor; the size's own if None, which is 256 "
+        "for `paper`",
+        Stage.CLONING,
     )
     bc_learning_rate: float = amount(
         1e-4, "of the prior actor at its first update; it falls linearly to 0", Stage.CLONING
@@ -286,17 +308,6 @@ class Hyperparameters(Keywords):
                 f"kickstart looks at {FRAMES} images in a row, but batch_length="
                 f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
             )
-
-    def value(self, name: str) -> Any:
-        """Return a keyword's value, the size's own where it is None."""
-        value = getattr(self, name)
-        if value is None and name in SIZES_OWN:
-            return getattr(find_size(self.size), SIZES_OWN[name])
-        return value
-
-    def resolved(self) -> Self:
-        """Return a copy in which the size's own values stand where None stood."""
-        return self.changed(**{name: self.value(name) for name in SIZES_OWN})
 
     @property
     def marks(self) -> bool:
@@ -320,11 +331,12 @@ class Hyperparameters(Keywords):
     @property
     def needs_clone(self) -> bool:
         """Whether the prior actor will ever act or be imitated."""
-        return self.imitates or self.ibrl or ever(parse_schedule(self.guidance))
+        guided = ever(parse_schedule(self.value("guidance")))
+        return self.imitates or self.ibrl or guided
 
     def guidance_at(self, step: int) -> float:
         """Return the probability that an episode that begins at this step is guided."""
-        return parse_schedule(self.guidance)(step)
+        return parse_schedule(self.value("guidance"))(step)
 
     def ent_coef_at(self, step: int) -> float:
         """Return the weight of the entropy at this step."""

@@ -20,11 +20,12 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.sizes import find_size
 from wpt_agents.training.guidance import parse_schedule
 
 Check = Callable[[str, Any], None]  # called with a keyword's name and value; raises ValueError
@@ -119,7 +120,7 @@ def choice(default: str, names: Collection[str], doc: str, stage: Stage = Stage.
     return keyword(default, check, doc, stage)
 
 
-def schedule(default: str | float, most: float, doc: str, stage: Stage = Stage.TASK) -> Any:
+def schedule(default: str | float | None, most: float, doc: str, stage: Stage = Stage.TASK) -> Any:
     """Declare a keyword that is a number or a schedule of one, as `parse_schedule` reads it."""
 
     def check(name: str, value: Any) -> None:
@@ -135,7 +136,14 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Keywords:
-    """The keywords of every `PixelAgent`. Subclasses add their own and may change defaults."""
+    """The keywords of every `PixelAgent`. Subclasses add their own and may change defaults.
+
+    :cvar sizes_own: keywords that are the size's own if None, and the fields of `Size` to read
+    :cvar size_keyword: the keyword that names the size
+    """
+
+    sizes_own: ClassVar[Mapping[str, str]] = {}
+    size_keyword: ClassVar[str] = "size"
 
     embodiment: str | None = keyword(
         None,
@@ -149,11 +157,17 @@ class Keywords:
         "entry of Dict observations that is the image to see; their only image if None",
         Stage.ACTING,
     )
-    learning_starts: int = count(
+    learning_starts: int | None = count(
         1_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )
-    warmup_steps: int = count(
+    warmup_steps: int | None = count(
         1_000, "steps at the start that uniform random actions drive", Stage.ACTING, least=0
+    )
+    max_trajectory_length: int = count(
+        1_000,
+        "steps after which an open episode is stored as a trajectory of its own, so that long and "
+        "endless episodes can be replayed while they go on. Each has a guidance window",
+        Stage.ACTING,
     )
     train_freq: str = choice(
         "episode",
@@ -173,6 +187,8 @@ class Keywords:
             object.__setattr__(self, item.name, value)
             if value is not None or item.default is not None:
                 item.metadata["keyword"].check(item.name, value)
+        for name in self.sizes_own:
+            self.declared()[name].check(name, self.value(name))
 
     @classmethod
     def declared(cls) -> dict[str, Keyword]:
@@ -211,8 +227,24 @@ class Keywords:
         return "\n".join(textwrap.fill(line, 96, subsequent_indent="    ") for line in lines)
 
     def value(self, name: str) -> Any:
-        """Return a keyword's value; where it is None, what takes its place if that is known."""
-        return getattr(self, name)
+        """Return a keyword's value, the size's own where it is None."""
+        value = getattr(self, name)
+        if value is None and name in self.sizes_own:
+            return getattr(find_size(getattr(self, self.size_keyword)), self.sizes_own[name])
+        return value
+
+    def resolved(self) -> Self:
+        """Return a copy in which the size's own values stand where None stood."""
+        return self.changed(**{name: self.value(name) for name in self.sizes_own})
+
+    def chosen(self) -> dict[str, Any]:
+        """Return the keywords that differ from their defaults, and all that the size decides."""
+        values = {item.name: (self.value(item.name), item.default) for item in fields(self)}
+        return {
+            name: value
+            for name, (value, default) in values.items()
+            if value != default or name in self.sizes_own
+        }
 
     def changed(self, **changes: Any) -> Self:
         """Return a copy in which some keywords have other values, which are checked."""

@@ -71,20 +71,18 @@ def check_class(header: Mapping[str, Any], path: ModelPath, expected: str) -> No
         raise ValueError(f"{path} is of {kind}: read it by {kind}.load, not {expected}.load")
 
 
-def check_same(
-    header: Mapping[str, Any], hyperparameters: Mapping[str, Any], names: tuple[str, ...]
-) -> None:
+def check_same(before: Mapping[str, Any], now: Mapping[str, Any], names: tuple[str, ...]) -> None:
     """Refuse to load weights that were trained with other values of some keywords.
 
+    :param before: the keywords of the model file
+    :param now: those of the agent that loads it
     :raises ValueError: naming both values
     """
     for name in names:
-        was = header["hyperparameters"][name]
-        now = hyperparameters[name]
-        if was != now:
+        if before[name] != now[name]:
             raise ValueError(
-                f"The model was trained with {name}={was!r}, now it is {now!r}. Pass the old "
-                "value, or use another model file or run_dir"
+                f"The model was trained with {name}={before[name]!r}, now it is {now[name]!r}. "
+                "Pass the old value, or use another model file or run_dir"
             )
 
 

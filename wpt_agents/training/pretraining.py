@@ -1,19 +1,22 @@
 """// Task-Agnostic World Model Pre-Training of Algorithm 1, on one device or many."""
 
+import warnings
 from collections.abc import Callable, Generator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
-from tqdm.auto import tqdm
 
+from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.training.distributed import Divided, World
 from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.training.logs import PretrainingLog
 from wpt_agents.training.progress import WorldModelProgress
 from wpt_agents.training.randomness import Purpose, Streams, torch_seed
+from wpt_agents.training.signals import StopSignals
 from wpt_agents.training.world_model_learner import (
     Metrics,
     WorldModelLearner,
@@ -61,7 +64,7 @@ def pretrain(
     world: World,
     steps: int,
     accumulate: int = 1,
-    path: Path | None = None,
+    run_dir: Path | None = None,
     progress_bar: bool = False,
     callback: Callback | None = None,
 ) -> None:
@@ -69,7 +72,7 @@ def pretrain(
 
     :param world: the processes that share the work; rank 0 alone writes files and calls back
     :param accumulate: passes over a batch, or a process's share of it, to save memory
-    :param path: where the model file is written every 1000 updates and at the end
+    :param run_dir: folder of the model file and of the learning curve
     :param callback: called after every update
     """
     assert model.dataset is not None
@@ -81,16 +84,96 @@ def pretrain(
     updates = world_model_updates(
         model.learner, model.dataset, model.streams, world, done, steps, accumulate, progress_bar
     )
-    with closing(updates):
+    with closing(updates), Pretraining(model, steps, run_dir, callback, world) as run:
         for metrics in updates:
-            done += 1
-            model.progress.pretrain_steps = done
-            if callback is not None and world.rank == 0:
-                callback(done, {name: float(value) for name, value in metrics.items()})
-            if path is not None and (done % EVERY == 0 or done == steps):
-                if world.rank == 0:
-                    model.save(path)
-                world.barrier()  # no process goes on, or ends, before the file is there
+            run.finish_update(metrics)
+
+
+class Pretraining:
+    """What every `pretrain` does after each update: it counts, logs, saves, and stops when asked.
+
+    With a run folder the model is saved every `EVERY` updates, at the end, and when Ctrl-C,
+    SIGTERM or the callback stops it. It is never saved in the middle of an update, so that
+    training that goes on from there equals training that was never stopped.
+
+    Example::
+
+        with Pretraining(agent, steps=1000, run_dir="runs/all") as run:
+            for metrics in updates:
+                run.finish_update(metrics)
+
+    :param agent: with `save`, `progress.pretrain_steps`, `tensorboard_log` and `verbose`
+    :param steps: updates in all
+    :param run_dir: folder of `model.zip` and of the log
+    :param callback: called after every update with (step, metrics)
+    :param world: the processes that share the work; rank 0 alone logs, saves and calls back
+    """
+
+    def __init__(
+        self,
+        agent: Any,
+        steps: int,
+        run_dir: Path | None = None,
+        callback: Callback | None = None,
+        world: World | None = None,
+    ) -> None:
+        self.agent = agent
+        self.steps = steps
+        self.run_dir = run_dir
+        self.callback = callback
+        self.world = world or World()
+        self.signals = StopSignals()
+        self.log: PretrainingLog | None = None
+
+    def __enter__(self) -> Self:
+        agent = self.agent
+        done = agent.progress.pretrain_steps
+        if self.world.rank == 0:
+            if self.run_dir is not None and done >= self.steps:
+                warnings.warn(
+                    f"{self.run_dir} holds a model of {done} updates already, so that steps="
+                    f"{self.steps} makes none: to train it further pass steps above {done}",
+                    stacklevel=4,
+                )
+            if agent.verbose:
+                print(agent)
+        if self.run_dir is not None:
+            self.signals.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.log is not None:
+            self.log.close()
+        self.signals.__exit__()
+
+    def finish_update(self, metrics: Metrics) -> None:
+        """Do what follows an update."""
+        agent = self.agent
+        progress = agent.progress
+        if self.log is None and self.world.rank == 0:  # not sooner: a refusal leaves no files
+            before = progress.pretrain_steps
+            self.log = PretrainingLog(self.run_dir, agent.tensorboard_log, agent.verbose, before)
+        progress.pretrain_steps += 1
+        if self.log is not None:
+            self.log.add(metrics)
+        if self.callback is not None and self.world.rank == 0:
+            try:
+                self.callback(progress.pretrain_steps, {k: float(v) for k, v in metrics.items()})
+            except (KeyboardInterrupt, SystemExit):
+                self._save()
+                raise
+        stop = self.world.largest(self.signals.received, agent.device)
+        if stop or progress.pretrain_steps % EVERY == 0 or progress.pretrain_steps == self.steps:
+            self._save()
+            self.world.barrier()  # no process goes on, or ends, before the file is there
+        if stop:
+            self.signals.deliver(stop)
+
+    def _save(self) -> None:
+        if self.log is not None:
+            self.log.write()
+        if self.run_dir is not None and self.world.rank == 0:
+            self.agent.save(self.run_dir / "model.zip")
 
 
 def world_model_updates(
@@ -129,16 +212,16 @@ def world_model_updates(
         update = whole_update(learner, streams)
     else:
         update = divided_update(learner, streams, world, accumulate)
-    shown = progress_bar and world.rank == 0
-    bar = tqdm(total=steps, initial=start, desc="pre-train", disable=not shown)
+    bar = StageBar(steps, "pre-train", progress_bar, start, silent=world.rank > 0)
     with bar, closing(batches):  # closing ends the thread that reads ahead
         for step, batch in zip(range(start, steps), batches, strict=False):
             metrics = update(batch, step)
             yield metrics
-            if step % 20 == 0:  # reading a loss waits for the GPU
+            values = {}
+            if step % 20 == 0 and bar.bar is not None:  # reading a loss waits for the GPU
                 loss = float(metrics["train/reconstruction_loss"])
-                bar.set_postfix(reconstruction=f"{loss:.1f}")
-            bar.update()
+                values["reconstruction"] = f"{loss:.1f}"
+            bar.update(values=values)
 
 
 def whole_update(learner: WorldModelLearner, streams: Streams) -> Update:

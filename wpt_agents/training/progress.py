@@ -19,7 +19,8 @@ class Progress:
     :ivar updates: updates that were made for a task
     :ivar credit: collected steps that no update has used yet
     :ivar windows_drawn: episodes for which a guidance window was drawn
-    :ivar seen_length: steps of the longest episode so far
+    :ivar seen_length: steps of the longest trajectory so far
+    :ivar cut: trajectories that were stored before their episode ended
     """
 
     num_timesteps: int = 0
@@ -28,6 +29,7 @@ class Progress:
     credit: float = 0.0
     windows_drawn: int = 0
     seen_length: int | None = None
+    cut: int = field(default=0, metadata={"earlier": 0})
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:

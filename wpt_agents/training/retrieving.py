@@ -42,11 +42,12 @@ def retrieve_ids(
             f"trajectories of any robot of {width} actions are retrieved, rehearsed and cloned",
             stacklevel=4,
         )
+    number = settings.value("num_retrieve")
     if settings.retrieval == "random":
         rng = streams.numpy(Purpose.RETRIEVE, 0)
-        numbers = retriever.draw(settings.num_retrieve, rng, known, width)
+        numbers = retriever.draw(number, rng, known, width)
     else:
-        numbers, _ = retriever.search(query, settings.num_retrieve, known, width)
+        numbers, _ = retriever.search(query, number, known, width)
     if len(numbers) == 0:
         raise ValueError(
             f"The dataset {dataset.path} has no trajectory of {width} actions to retrieve; add "

@@ -45,10 +45,13 @@ class Acting(Protocol):
 class Rollout:
     """Record steps until an episode ends, and let a guide act inside of its window.
 
+    A long episode is recorded as several trajectories, one after the other, so that it can be
+    replayed while it goes on. Each has a window of its own; the policy does not notice the cut.
+
     :param policy: decides on the actions outside of the windows
     :param n_envs: number of environments, each with one open episode
     :param action_dim: width of the actions that are recorded, the environment's own
-    :param draw_window: called when an episode begins; the steps at which the guide acts
+    :param draw_window: called when a trajectory begins; the steps at which the guide acts
     :param guide: decides on the actions inside of the windows
     :param generator: random numbers of the policy
     :param embodiment: name of the robot, written on each trajectory
@@ -72,7 +75,9 @@ class Rollout:
         self.embodiment = embodiment
         self.state: State = policy.initial_state(n_envs)
         self.frames: np.ndarray | None = None
-        self.first = np.ones(n_envs, bool)
+        self.first = np.ones(n_envs, bool)  # an episode begins
+        self.begins = np.ones(n_envs, bool)  # a trajectory begins: an episode, or a part of one
+        self.opening: list[np.ndarray | None] = [None] * n_envs  # the first image of each episode
         self.windows: list[Window] = [(0, 0)] * n_envs
         self.images: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
         self.actions: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
@@ -84,8 +89,10 @@ class Rollout:
         :param image: (n, 64, 64, 3) uint8
         :return: (n, A) in [-1, 1]
         """
-        for i in np.flatnonzero(self.first):
+        for i in np.flatnonzero(self.begins):
             self.windows[i] = self.draw_window()
+        for i in np.flatnonzero(self.first):
+            self.opening[i] = image[i].copy()
         # Kept at every step, because the guide's window may begin at any.
         self.frames = stack_frames(image, self.frames, self.first)
         action, state = self.policy.act(image, self.state, self.first, generator=self.generator)
@@ -101,27 +108,42 @@ class Rollout:
             self.actions[i].append(row[: self.action_dim].copy())
         return action
 
+    def full(self, done: np.ndarray, longest: int) -> np.ndarray:
+        """Return which open episodes are to be stored so far, (n,) bool.
+
+        :param done: (n,) bool, which episodes the present step ended
+        :param longest: steps of a trajectory
+        """
+        lengths = np.array([len(actions) for actions in self.actions])
+        full: np.ndarray = (lengths >= longest) & ~done
+        return full
+
+    def longest_open(self) -> int:
+        """Return the steps of the longest open trajectory."""
+        return max(len(actions) for actions in self.actions)
+
     def end_step(
         self, reward: np.ndarray, done: np.ndarray, last: dict[int, tuple[np.ndarray, bool]]
     ) -> list[Trajectory]:
-        """Record what the step led to; return the episodes that it ended.
+        """Record what the step led to; return the trajectories that it completed.
 
         :param reward: (n,)
-        :param done: (n,) bool
-        :param last: for each ended episode its last image (64, 64, 3) and whether it terminated
+        :param done: (n,) bool, which episodes ended
+        :param last: for each completed trajectory its last image (64, 64, 3), and whether its
+            episode terminated
         """
         finished = []
         for i, value in enumerate(reward):
             self.rewards[i].append(float(value))
-            if done[i]:
-                image, terminated = last[i]
-                finished.append(self._finish(i, image, terminated))
+            if i in last:
+                finished.append(self._finish(i, *last[i]))
         self.first = done.copy()
+        self.begins = np.array([i in last for i in range(len(reward))])
         return finished
 
     def first_image(self, i: int) -> np.ndarray | None:
         """Return the first image of an open episode, None before its first step."""
-        return self.images[i][0] if self.images[i] else None
+        return None if self.first[i] else self.opening[i]
 
     def _finish(self, i: int, image: np.ndarray, terminated: bool) -> Trajectory:
         trajectory = Trajectory(
@@ -187,13 +209,22 @@ def wait_for_workers(env: VecEnv) -> None:
 
 
 def last_images(
-    env: VecEnv | None, infos: list[dict[str, Any]], dones: np.ndarray, new_obs: Any
+    env: VecEnv | None,
+    infos: list[dict[str, Any]],
+    dones: np.ndarray,
+    new_obs: Any,
+    full: np.ndarray,
 ) -> dict[int, tuple[np.ndarray, bool]]:
-    """Return for each ended episode its last image and whether it terminated (no time limit).
+    """Return for each completed trajectory its last image and whether the episode terminated.
 
-    :param new_obs: (n, ...), what the step returned: the first observations of new episodes
+    An episode that is cut, or that a time limit ends, has not terminated.
+
+    :param new_obs: (n, ...), what the step returned; where an episode ended, the first observation
+        of the next
+    :param full: (n,) bool, which episodes are cut after this step and go on
     """
-    return {
+    cut = {int(i): (to_images(new_obs[i])[0][0], False) for i in np.flatnonzero(full)}
+    return cut | {
         int(i): (
             to_images(last_observation(env, infos, i, new_obs[i]))[0][0],
             not infos[i].get("TimeLimit.truncated", False),

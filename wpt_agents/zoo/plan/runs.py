@@ -12,6 +12,7 @@ import numpy as np
 from wpt_envs.rendering import QUALITIES
 from wpt_envs.tasks import Task
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import unknown_name
@@ -106,8 +107,12 @@ class Run:
 
     @property
     def full_keywords(self) -> Mapping[str, Any]:
-        """The keywords of the agent with the defaults of those that nobody set."""
-        return {**defaults(self.algorithm.agent), **self.keywords}
+        """The keywords of the agent with the defaults, or its size's own, of those not set."""
+        agent = self.algorithm.agent
+        values = {**defaults(agent), **self.keywords}
+        if issubclass(agent, PixelAgent):
+            values |= agent.keywords(**self.keywords).resolved().as_dict()
+        return values
 
     @property
     def retrieves(self) -> bool:
@@ -124,7 +129,8 @@ class Run:
         """The updates that fine-tuning will make, within an episode's worth; None if unknown."""
         agent = SimpleNamespace(**self.full_keywords)
         if hasattr(agent, "update_every"):
-            return max(self.preset.steps - agent.learning_starts, 0) // agent.update_every
+            paying = max(self.preset.steps - int(agent.learning_starts), 0)
+            return paying // int(agent.update_every)
         if not issubclass(self.algorithm.agent, WPT):
             return None
         if self.preset.steps < agent.learning_starts:

@@ -227,7 +227,9 @@ class Checkpoints(BaseCallback):
         self.written = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        if self.every and self.model.num_timesteps - self.written >= self.every:
+        starts = self.model._last_episode_starts
+        between = starts is not None and starts.all()  # not after a part of a long episode
+        if self.every and between and self.model.num_timesteps - self.written >= self.every:
             write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
             self.written = self.model.num_timesteps
 

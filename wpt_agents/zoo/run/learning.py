@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.logs import ContinuedCSV
 from wpt_agents.zoo.judge.evaluation import episode_steps, make_vec_env
 from wpt_agents.zoo.pictures import retrieval
 from wpt_agents.zoo.plan.runs import Run
@@ -25,7 +26,7 @@ from wpt_agents.zoo.run.checkpoints import (
     HeadStart,
     resumes,
 )
-from wpt_agents.zoo.run.logs import ContinuedCSV, Evaluations, go_to_episode
+from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.tasks import metric_of, short_name
 from wpt_agents.zoo.terminal import say

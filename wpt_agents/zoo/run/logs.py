@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.zoo.result import Metric
@@ -81,22 +80,3 @@ class Evaluations(EvalCallback):
 def go_to_episode(venv: VecEnv, number: int) -> None:
     """The next reset of environments under `EpisodeSeeds` begins episode `number`."""
     venv.env_method("go_to_episode", number)
-
-
-class ContinuedCSV(CSVOutputFormat):
-    """SB3's `progress.csv`, which goes on with the rows that are there."""
-
-    def __init__(self, path: Path) -> None:
-        before = path.read_text(encoding="utf-8") if path.exists() else ""
-        super().__init__(str(path))
-        self.file.write(before)
-        self.file.flush()
-        self.keys = before.partition("\n")[0].split(",") if before else []
-
-    def keep(self, rows: int) -> None:
-        """Keep the first `rows` rows and drop the others."""
-        self.file.seek(0)
-        lines = self.file.readlines()[: 1 + rows]
-        self.file.seek(0)
-        self.file.truncate()
-        self.file.writelines(lines)

@@ -5,14 +5,12 @@ Each is made once and reused by later runs; a half-finished one is continued.
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
@@ -26,11 +24,7 @@ from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.plan.shared import Shared, key
 from wpt_agents.zoo.result import Score, read_score, write_score
 from wpt_agents.zoo.run.locks import locked, write_json
-from wpt_agents.zoo.run.logs import ContinuedCSV
 from wpt_agents.zoo.terminal import say
-
-Callback = Callable[[int, dict[str, float]], None]  # of pre-training
-LOG_EVERY = 50  # updates of pre-training
 
 
 def collect_data(shared: Shared) -> TrajectoryDataset:
@@ -98,8 +92,7 @@ def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
         say("pretrain", f"{state} {what} of {updates}  [dim]{folder}")
         if not finished:
             start = time.perf_counter()
-            with log_in(folder) if world.rank == 0 else nullcontext() as callback:
-                _pretrain(shared, dataset, callback)
+            _pretrain(shared, dataset)
             if world.rank == 0:
                 write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
     return model
@@ -112,7 +105,7 @@ def shipped_model(name: str) -> Path:
     return shipped()[name]
 
 
-def _pretrain(shared: Shared, dataset: TrajectoryDataset, callback: Callback | None) -> None:
+def _pretrain(shared: Shared, dataset: TrajectoryDataset) -> None:
     agent: Any = shared.agent  # SB3's class has no `pretrain`; those of pre-trained methods do
     agent.pretrain(
         dataset,
@@ -121,7 +114,6 @@ def _pretrain(shared: Shared, dataset: TrajectoryDataset, callback: Callback | N
         seed=shared.preset.pretrain.seed,
         device=shared.device,
         progress_bar=True,
-        callback=callback,
         accumulate=shared.accumulate,
         **shared.pretraining,
     )
@@ -137,29 +129,3 @@ def play_untrained(shared: Shared, name: str, task: Task, seed: int) -> Score:
     score = evaluate(BASELINES[name](space, seed), task.id, shared.env, episodes, seed, name)
     write_score(path, score)
     return score
-
-
-@contextmanager
-def log_in(folder: Path) -> Iterator[Callback]:
-    """Open a callback of pre-training that logs to `folder`, as a table and for TensorBoard."""
-    table = ContinuedCSV(folder / "progress.csv")
-    logger = Logger(str(folder), [table, TensorBoardOutputFormat(str(folder))])
-    with closing(logger):
-        yield writing_to(logger, table)
-
-
-def writing_to(logger: Logger, table: ContinuedCSV) -> Callback:
-    """Return a callback of pre-training that logs the metrics' means over `LOG_EVERY` updates."""
-    begun = False
-
-    def write(step: int, metrics: dict[str, float]) -> None:
-        nonlocal begun
-        if not begun:  # rows from after the checkpoint are made again
-            table.keep(rows=(step - 1) // LOG_EVERY)
-            begun = True
-        for name, value in metrics.items():
-            logger.record_mean(name, value)
-        if step % LOG_EVERY == 0:
-            logger.dump(step)
-
-    return write

@@ -1,0 +1,157 @@
+"""Whether a call of `learn` makes any update, and what to say if it makes none."""
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any, Self
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What decides whether a call of `learn` makes updates.
+
+    Steps are calls of `env.step`, counted once for every environment.
+
+    :param start: steps before the call
+    :param stop: steps after the call
+    :param n_envs: number of environments
+    :param replay: whether there is something to replay
+    :param opened: steps of the longest open episode, in one environment
+    :param longest: steps after which an open episode is stored, `max_trajectory_length`
+    :param limit: steps of an episode, if they are known
+    :param price: steps that pay for one update; infinitely many where none is expected
+    :param credit: earlier steps that no update has used
+    :param learning_starts: steps before the first update
+    :param warmup_pays: whether the steps before `learning_starts` pay, too
+    :param warmup_steps: steps in which each episode that begins is driven by the guide alone
+    :param cheaper: an assignment by which the call's steps pay for an update, "" for none
+    :param driver: who drives the warm-up
+    """
+
+    start: int
+    stop: int
+    n_envs: int
+    replay: bool
+    opened: int
+    longest: int
+    limit: int | None
+    price: float
+    credit: float
+    learning_starts: int
+    warmup_pays: bool
+    warmup_steps: int
+    cheaper: str
+    driver: str = "random actions"
+
+    @classmethod
+    def of(cls, agent: Any) -> Self:
+        """Return what decides whether a `PixelAgent` makes updates until `_total_timesteps`."""
+        rollout = agent.rollout
+        fresh = rollout is None or agent._last_episode_starts.all()
+        n_envs = agent.n_envs
+        return cls(
+            start=agent.num_timesteps,
+            stop=math.ceil(agent._total_timesteps / n_envs) * n_envs,
+            n_envs=n_envs,
+            replay=len(agent.replay_buffer) > 0,
+            opened=0 if fresh else rollout.longest_open(),
+            longest=agent.max_trajectory_length,
+            limit=agent.time_limit(),
+            price=agent.steps_per_update() if agent.updates_per_step else math.inf,
+            credit=agent.credit,
+            learning_starts=agent.learning_starts,
+            warmup_pays=agent.warmup_pays,
+            warmup_steps=agent.warmup_steps,
+            cheaper=agent.cheaper_updates(agent._total_timesteps - agent.num_timesteps),
+            driver=agent.warmup_driver,
+        )
+
+    def warn(self, over: bool, learns: bool) -> None:
+        """Warn of a call that makes no update, or in which the policy never acts.
+
+        :param learns: whether it has made updates, or need not make any
+        """
+        expected = not learns and self.price < math.inf
+        for text in (self.no_update(over) if expected else None, self.warm_up_only()):
+            if text is not None:
+                warnings.warn(text, stacklevel=5)
+
+    @property
+    def steps(self) -> int:
+        """The steps of this call."""
+        return self.stop - self.start
+
+    @property
+    def paid_from(self) -> int:
+        """The step from which on steps pay for updates."""
+        return self.start if self.warmup_pays else max(self.start, self.learning_starts)
+
+    def first_stored(self, over: bool) -> int:
+        """Return the steps of this call until something can be replayed, as far as one can tell.
+
+        :param over: whether the call is over. Until then an episode of unknown length may end soon
+        """
+        if self.replay:
+            return 0
+        length = self.limit or (self.longest if over else 1)
+        return max(min(length, self.longest) - self.opened, 1) * self.n_envs
+
+    def needed(self, over: bool) -> int:
+        """Return the steps that this call would have to last for its first update."""
+        first = max(
+            self.start + self.first_stored(over),
+            self.learning_starts,
+            self.paid_from + math.ceil(self.price - self.credit - 1e-9),
+        )
+        return math.ceil((first - self.start) / self.n_envs) * self.n_envs
+
+    def obstacles(self, over: bool) -> dict[str, str]:
+        """Return what stands in the way of the first update, and an assignment that removes it."""
+        obstacles = {}
+        affordable = self.credit + self.steps >= self.price - 1e-9
+        paid = self.credit + self.stop - self.paid_from >= self.price - 1e-9
+        if self.stop < self.learning_starts or (affordable and not paid):
+            text = f"no update is made in the first learning_starts={self.learning_starts} steps"
+            obstacles[text] = "model.learning_starts = 0"
+        if self.first_stored(over) > self.steps:
+            text = "nothing can be replayed before an episode ends or has max_trajectory_length="
+            known = f"; an episode has {self.limit} steps" if self.limit else ""
+            shorter = max(1, self.steps // self.n_envs)
+            obstacles[f"{text}{self.longest} steps{known}"] = (
+                f"model.max_trajectory_length = {shorter}"
+            )
+        if not affordable:
+            obstacles[f"an update is made for every {self.price:g} collected steps"] = self.cheaper
+        return obstacles
+
+    def no_update(self, over: bool) -> str | None:
+        """Return what to say if the call makes no update, None if it makes some.
+
+        :param over: whether the call is over and has made none
+        """
+        obstacles = self.obstacles(over)
+        if not over and not obstacles:
+            return None
+        sooner = " unless an episode ends sooner" if self.limit and not self.replay else ""
+        verb = "made no update" if over else f"will make no update{sooner}"
+        if not obstacles:
+            return (
+                f"learn({self.steps}) {verb}: it was stopped before the first one. Continue by "
+                "learn(..., reset_num_timesteps=False)"
+            )
+        assignments = " and ".join(text for text in obstacles.values() if text)
+        setting = f", or set {assignments} before it" if all(obstacles.values()) else ""
+        return (
+            f"learn({self.steps}) {verb}: {'; '.join(obstacles)}. Let it last at least "
+            f"{self.needed(over)} steps{setting}"
+        )
+
+    def warm_up_only(self) -> str | None:
+        """Return what to say if the policy itself never acts in this call, else None."""
+        if self.stop > self.warmup_steps:
+            return None
+        return (
+            f"learn({self.steps}) collects nothing but {self.driver}: warmup_steps="
+            f"{self.warmup_steps}. Let it last more than {self.warmup_steps - self.start} steps, "
+            "or set model.warmup_steps = 0 before it"
+        )

@@ -1,0 +1,66 @@
+"""Ctrl-C and SIGTERM, deferred until an update is complete and the model is saved."""
+
+import signal
+import threading
+from types import FrameType
+from typing import Any, Self
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """Take note of Ctrl-C and SIGTERM while the block runs; a second one takes effect at once.
+
+    Example::
+
+        with StopSignals() as signals:
+            for batch in batches:
+                update(batch)
+                if signals.received:
+                    save()
+                    signals.deliver(signals.received)
+
+    Signals that the process ignores stay ignored, and outside of the main thread, where Python
+    handles no signals, the block changes nothing.
+
+    :ivar received: the number of the signal that was received, 0 for none
+    """
+
+    def __init__(self) -> None:
+        self.received = 0
+        self._before: dict[int, Any] = {}  # handlers by signal
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                handler = signal.getsignal(number)
+                if handler not in (signal.SIG_IGN, None):
+                    self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+        if self.received:  # after the last update
+            signal.raise_signal(self.received)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.received:
+            self.deliver(number)
+        self.received = number
+
+    def deliver(self, number: int) -> None:
+        """Let a signal do what it would have done without this block.
+
+        If the process goes on after it, as its own handler may decide, signals are noted again.
+        """
+        self.received = 0
+        before = dict(self._before)
+        self._restore()
+        signal.raise_signal(number)
+        for again in before:
+            self._before[again] = signal.signal(again, self._note)
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before.clear()

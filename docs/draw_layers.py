@@ -10,7 +10,7 @@ LAYERS = [
     (
         "agents",
         "one algorithm per file",
-        "WPT (Algorithm 1), DrQ-v2, RLPD, JSRL, R3M, PackNet, curiosity",
+        "WPT (Algorithm 1), DrQ-v2, RLPD, JSRL, R3M, PackNet, MR.Q, curiosity",
     ),
     (
         "training",

@@ -46,10 +46,18 @@ MOVED |= {
 
 # Modules of which more than one has come; names are looked up in all of them.
 SPLIT = {
-    "wpt_agents.networks": tuple(f"wpt_agents.model.{n}" for n in ("images", "layers", "sizes")),
-    "wpt_agents.policy": tuple(
-        f"wpt_agents.model.{n}" for n in ("policy", "prior_policy", "observations")
-    ),
+    f"{PACKAGE}.{old}": tuple(f"{PACKAGE}.{name}" for name in names)
+    for old, names in {
+        "acting": ("fast.acting", "fast.acting_networks", "fast.tape"),
+        "checks": ("training.checks", "training.spaces", "training.keywords"),
+        "networks": (
+            *("model.images", "model.layers", "model.sizes"),
+            *("fast.convolutions", "fast.products", "fast.pieces", "fast.conditions"),
+        ),
+        "policy": ("model.policy", "model.prior_policy", "model.observations"),
+        "scan": ("fast.scan", "fast.tape"),
+        "updates": ("training.learner", "training.randomness"),
+    }.items()
 }
 MOVED["wpt_agents.networks"] = "wpt_agents.model.images"
 

@@ -25,54 +25,64 @@ Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])
 
 
+CaseOption = Annotated[Case, typer.Argument(help="What to measure.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")]
+Quick = Annotated[
+    bool, typer.Option(help="Only check that it runs, in seconds; the numbers mean little.")
+]
+Threads = Annotated[
+    int,
+    typer.Option(min=1, help="Threads of torch; several threads take turns with a single one."),
+]
+PrecisionOption = Annotated[Precision, typer.Option(help="The precision of the forward passes.")]
+Compiled = Annotated[
+    bool,
+    typer.Option(
+        "--compile",
+        help="For model and gpu: compile scan and imagination by torch.compile, in minutes.",
+    ),
+]
+PeerOption = Annotated[
+    Peer | None,
+    typer.Option(help="For model: measure this library's DreamerV3 beside ours instead."),
+]
+Plot = Annotated[
+    Path | None, typer.Option(help="For scaling: draw the measurements into this file.")
+]
+Updates = Annotated[
+    int | None, typer.Option(min=1, help="For prediction: the updates of each model.")
+]
+Behaviour = Annotated[
+    list[str] | None,
+    typer.Option(help="For exploration: measure this behaviour only; can be repeated."),
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(min=1, help="For exploration: the steps that explore-state learns from."),
+]
+Probe = Annotated[
+    bool,
+    typer.Option(
+        "--probe",
+        help="In the case prediction, show instead how well linear probes read the true state "
+        "from the latents.",
+    ),
+]
+
+
 def bench(
-    case: Annotated[Case, typer.Argument(help="What to measure.")] = Case.all,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object per line.")
-    ] = False,
-    quick: Annotated[
-        bool, typer.Option(help="Only check that it runs, in seconds; the numbers mean little.")
-    ] = (False),
-    threads: Annotated[
-        int,
-        typer.Option(min=1, help="Threads of torch; several threads take turns with a single one."),
-    ] = 1,
-    precision: Annotated[
-        Precision, typer.Option(help="The precision of the forward passes.")
-    ] = Precision.fp32,
-    compiled: Annotated[
-        bool,
-        typer.Option(
-            "--compile",
-            help="For model and gpu: compile scan and imagination by torch.compile, in minutes.",
-        ),
-    ] = False,
-    peer: Annotated[
-        Peer | None,
-        typer.Option(help="For model: measure this library's DreamerV3 beside ours instead."),
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="For scaling: draw the measurements into this file.")
-    ] = None,
-    updates: Annotated[
-        int | None, typer.Option(min=1, help="For prediction: the updates of each model.")
-    ] = None,
-    behaviour: Annotated[
-        list[str] | None,
-        typer.Option(help="For exploration: measure this behaviour only; can be repeated."),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(min=1, help="For exploration: the steps that explore-state learns from."),
-    ] = None,
-    probe: Annotated[
-        bool,
-        typer.Option(
-            "--probe",
-            help="In the case prediction, show instead how well linear probes read the true state "
-            "from the latents.",
-        ),
-    ] = False,
+    case: CaseOption = Case.all,
+    as_json: AsJson = False,
+    quick: Quick = (False),
+    threads: Threads = 1,
+    precision: PrecisionOption = Precision.fp32,
+    compiled: Compiled = False,
+    peer: PeerOption = None,
+    plot: Plot = None,
+    updates: Updates = None,
+    behaviour: Behaviour = None,
+    steps: Steps = None,
+    probe: Probe = False,
 ) -> None:
     """Measure speed on this machine: medians after a warm-up.
 

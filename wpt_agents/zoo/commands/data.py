@@ -3,17 +3,17 @@
 Imports are inside the commands so that `--help` answers at once.
 """
 
-import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from wpt_agents.zoo.commands.importing import import_data, print_summary
 from wpt_agents.zoo.commands.options import Rendering, Spaced, Suite, Tasks, Workers
 from wpt_agents.zoo.commands.retrieval import Picture, retrieve, show_retrieval
 
 if TYPE_CHECKING:
-    from wpt_agents.data.dataset import TrajectoryDataset
+    pass
 
 data = typer.Typer(no_args_is_help=True, help="Show, check and join datasets.")
 Store = Annotated[Path, typer.Argument(help="The folder of a dataset.")]
@@ -31,49 +31,55 @@ def register(app: typer.Typer) -> None:
     app.add_typer(retrieve, name="retrieve")
 
 
+Out = Annotated[
+    Path, typer.Option(help="The folder of the dataset; an unfinished one is continued.")
+]
+Episodes = Annotated[
+    int | None,
+    typer.Option(min=1, help="Episodes of each task, as many as the paper's by default."),
+]
+Behaviour = Annotated[
+    str,
+    typer.Option(
+        help="How to act: noise, random, scripted (Meta-World), policy, explore-state, icm or "
+        "plan2explore. By default scripted in metaworld and noise elsewhere."
+    ),
+]
+Sigma = Annotated[
+    list[float],
+    typer.Option(help="Standard deviations of the noise on scripted and saved policies, in turn."),
+]
+Policy = Annotated[
+    str | None,
+    typer.Option(
+        help="The model for the behaviour policy: a file of WPT, or of SB3 as `sac:FILE`."
+    ),
+]
+Rewards = Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")]
+Settings = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Keywords of WPT for icm and plan2explore; steps=N for explore-state.",
+    ),
+]
+RenderingOption = Annotated[Rendering, typer.Option(help="The quality of the images.")]
+
+
 def collect_data(
-    out: Annotated[
-        Path, typer.Option(help="The folder of the dataset; an unfinished one is continued.")
-    ],
+    out: Out,
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006  # typer wants a list
-    episodes: Annotated[
-        int | None,
-        typer.Option(min=1, help="Episodes of each task, as many as the paper's by default."),
-    ] = None,
+    episodes: Episodes = None,
     seed: int = 0,
     workers: Workers = 2,
-    behaviour: Annotated[
-        str,
-        typer.Option(
-            help="How to act: noise, random, scripted (Meta-World), policy, explore-state, icm or "
-            "plan2explore. By default scripted in metaworld and noise elsewhere."
-        ),
-    ] = "",
-    sigma: Annotated[
-        list[float],
-        typer.Option(
-            help="Standard deviations of the noise on scripted and saved policies, in turn."
-        ),
-    ] = [0.1, 0.3, 0.5, 1.0, 2.0],  # noqa: B006
-    policy: Annotated[
-        str | None,
-        typer.Option(
-            help="The model for the behaviour policy: a file of WPT, or of SB3 as `sac:FILE`."
-        ),
-    ] = None,
-    rewards: Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")] = False,
-    settings: Annotated[
-        list[str],
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Keywords of WPT for icm and plan2explore; steps=N for explore-state.",
-        ),
-    ] = [],  # noqa: B006
-    rendering: Annotated[
-        Rendering, typer.Option(help="The quality of the images.")
-    ] = Rendering.near,
+    behaviour: Behaviour = "",
+    sigma: Sigma = [0.1, 0.3, 0.5, 1.0, 2.0],  # noqa: B006
+    policy: Policy = None,
+    rewards: Rewards = False,
+    settings: Settings = [],  # noqa: B006
+    rendering: RenderingOption = Rendering.near,
 ) -> None:
     """Play tasks and store the episodes, without rewards by default.
 
@@ -101,126 +107,7 @@ def collect_data(
         out, ids, episodes, seed, workers, behaviour, {"rendering": str(rendering)},
         rewards=rewards, sigmas=sigma, policy=policy, settings=keywords(settings, valid),
     )  # fmt: skip
-    _print_summary(dataset)
-
-
-def import_data(
-    form: Annotated[
-        str,
-        typer.Argument(
-            metavar="FORMAT",
-            help="hdf5, lerobot, minari, npz, official, rlds, sb3, tdmpc2, zarr, or auto to "
-            "recognise it.",
-        ),
-    ],
-    source: Annotated[
-        str,
-        typer.Argument(metavar="SRC", help="A folder, a file, or the name of a Minari dataset."),
-    ],
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DST", help="The dataset's folder; a conversion that was cut short goes on."
-        ),
-    ],
-    embodiment: Annotated[
-        str | None, typer.Option(help="The name of the robot, for all episodes.")
-    ] = None,
-    task: Annotated[
-        str | None, typer.Option(help="The name of the task, for all episodes.")
-    ] = None,
-    rewards: Annotated[bool, typer.Option("--rewards", help="Keep the rewards.")] = False,
-    image_size: Annotated[
-        int, typer.Option(min=1, help="Resize images to this height and width; WPT takes 64.")
-    ] = 64,
-    crop: Annotated[
-        bool, typer.Option("--crop", help="Cut out the middle square instead of squeezing images.")
-    ] = False,
-    image_key: Annotated[
-        str | None, typer.Option(help="Name of the images' array, or of the camera.")
-    ] = None,
-    action_key: Annotated[
-        str | None,
-        typer.Option(help="Name of the actions' array, or several with commas between them."),
-    ] = None,
-    done_key: Annotated[
-        str | None, typer.Option(help="Name of the flags at which episodes end.")
-    ] = None,
-    shifted: Annotated[
-        bool | None,
-        typer.Option(
-            "--shifted/--no-shifted",
-            help="hdf5 and zarr: whether a row's action led to its observation (dm_env) or was "
-            "taken at it.",
-        ),
-    ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="lerobot: name of the camera, as --image-key.")
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="rlds: read this split only, for example train.")
-    ] = None,
-    low: Annotated[
-        str | None,
-        typer.Option(help="Lowest values of the actions, if not -1: `--low=-2,-2`, or one."),
-    ] = None,
-    high: Annotated[
-        str | None, typer.Option(help="Highest values of the actions, if not 1: `--high=2,2`.")
-    ] = None,
-    trust: Annotated[
-        bool,
-        typer.Option("--trust", help="sb3 and tdmpc2: load a pickle, which may run any code."),
-    ] = False,
-) -> None:
-    """Convert other people's data into a dataset; the same command continues an unfinished one.
-
-    Example: `python -m wpt_agents.zoo import npz exorl/walker data/walker --embodiment walker`
-    """
-    from wpt_agents.data.dataset import TrajectoryDataset
-    from wpt_agents.data.importers.formats import open_episodes
-
-    choices: dict[str, Any] = {
-        "image_key": image_key,
-        "action_key": action_key,
-        "done_key": done_key,
-        "crop": crop or None,
-        "shifted": shifted,
-        "camera": camera,
-        "split": split,
-        "low": _numbers("--low", low),
-        "high": _numbers("--high", high),
-        "trust": trust or None,
-    }
-    options = {name: value for name, value in choices.items() if value is not None}
-    shared = {"embodiment": embodiment, "task": task, "rewards": rewards, "image_size": image_size}
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = _show_warning
-        episodes = open_episodes(source, None if form == "auto" else form, **shared, **options)
-        dataset = TrajectoryDataset.from_episodes(episodes, out, progress_bar=True)
-    _print_summary(dataset)
-
-
-def _numbers(option: str, text: str | None) -> list[float] | None:
-    if text is None:
-        return None
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(f"{option} takes numbers separated by commas, got {text!r}") from None
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.secho(f"Warning: {message}", fg="yellow", err=True)
-
-
-def _print_summary(dataset: "TrajectoryDataset") -> None:
-    """Print what the dataset contains for each robot, and where it is."""
-    from wpt_agents.zoo.pictures.datasets import data_table
-    from wpt_agents.zoo.terminal import console
-
-    console.print(data_table(dataset))
-    typer.echo(f"Dataset: {dataset.path.resolve()}")
+    print_summary(dataset)
 
 
 def show_data(
@@ -238,7 +125,7 @@ def show_data(
     from wpt_agents.zoo.pictures.datasets import contact_sheet
 
     dataset = TrajectoryDataset.open(folder)
-    _print_summary(dataset)
+    print_summary(dataset)
     if len(dataset):
         contact_sheet(out, dataset, rows)
         typer.echo(f"Contact sheet: {out.resolve()}")
@@ -281,4 +168,4 @@ def merge_data(
     """
     from wpt_agents.data.dataset import TrajectoryDataset
 
-    _print_summary(TrajectoryDataset.merge(out, folders))
+    print_summary(TrajectoryDataset.merge(out, folders))

@@ -1,0 +1,135 @@
+"""The command that converts other people's data: import."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from wpt_agents.data.dataset import TrajectoryDataset
+
+Form = Annotated[
+    str,
+    typer.Argument(
+        metavar="FORMAT",
+        help="hdf5, lerobot, minari, npz, official, rlds, sb3, tdmpc2, zarr, or auto to "
+        "recognise it.",
+    ),
+]
+Source = Annotated[
+    str,
+    typer.Argument(metavar="SRC", help="A folder, a file, or the name of a Minari dataset."),
+]
+Out = Annotated[
+    Path,
+    typer.Argument(
+        metavar="DST", help="The dataset's folder; a conversion that was cut short goes on."
+    ),
+]
+Embodiment = Annotated[str | None, typer.Option(help="The name of the robot, for all episodes.")]
+Task = Annotated[str | None, typer.Option(help="The name of the task, for all episodes.")]
+Rewards = Annotated[bool, typer.Option("--rewards", help="Keep the rewards.")]
+ImageSize = Annotated[
+    int, typer.Option(min=1, help="Resize images to this height and width; WPT takes 64.")
+]
+Crop = Annotated[
+    bool, typer.Option("--crop", help="Cut out the middle square instead of squeezing images.")
+]
+ImageKey = Annotated[str | None, typer.Option(help="Name of the images' array, or of the camera.")]
+ActionKey = Annotated[
+    str | None,
+    typer.Option(help="Name of the actions' array, or several with commas between them."),
+]
+DoneKey = Annotated[str | None, typer.Option(help="Name of the flags at which episodes end.")]
+Shifted = Annotated[
+    bool | None,
+    typer.Option(
+        "--shifted/--no-shifted",
+        help="hdf5 and zarr: whether a row's action led to its observation (dm_env) or was "
+        "taken at it.",
+    ),
+]
+Camera = Annotated[str | None, typer.Option(help="lerobot: name of the camera, as --image-key.")]
+Split = Annotated[str | None, typer.Option(help="rlds: read this split only, for example train.")]
+Low = Annotated[
+    str | None,
+    typer.Option(help="Lowest values of the actions, if not -1: `--low=-2,-2`, or one."),
+]
+High = Annotated[
+    str | None, typer.Option(help="Highest values of the actions, if not 1: `--high=2,2`.")
+]
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="sb3 and tdmpc2: load a pickle, which may run any code."),
+]
+
+
+def import_data(
+    form: Form,
+    source: Source,
+    out: Out,
+    embodiment: Embodiment = None,
+    task: Task = None,
+    rewards: Rewards = False,
+    image_size: ImageSize = 64,
+    crop: Crop = False,
+    image_key: ImageKey = None,
+    action_key: ActionKey = None,
+    done_key: DoneKey = None,
+    shifted: Shifted = None,
+    camera: Camera = None,
+    split: Split = None,
+    low: Low = None,
+    high: High = None,
+    trust: Trust = False,
+) -> None:
+    """Convert other people's data into a dataset; the same command continues an unfinished one.
+
+    Example: `python -m wpt_agents.zoo import npz exorl/walker data/walker --embodiment walker`
+    """
+    from wpt_agents.data.dataset import TrajectoryDataset
+    from wpt_agents.data.importers.formats import open_episodes
+
+    choices: dict[str, Any] = {
+        "image_key": image_key,
+        "action_key": action_key,
+        "done_key": done_key,
+        "crop": crop or None,
+        "shifted": shifted,
+        "camera": camera,
+        "split": split,
+        "low": _numbers("--low", low),
+        "high": _numbers("--high", high),
+        "trust": trust or None,
+    }
+    options = {name: value for name, value in choices.items() if value is not None}
+    shared = {"embodiment": embodiment, "task": task, "rewards": rewards, "image_size": image_size}
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = _show_warning
+        episodes = open_episodes(source, None if form == "auto" else form, **shared, **options)
+        dataset = TrajectoryDataset.from_episodes(episodes, out, progress_bar=True)
+    print_summary(dataset)
+
+
+def _numbers(option: str, text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{option} takes numbers separated by commas, got {text!r}") from None
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    typer.secho(f"Warning: {message}", fg="yellow", err=True)
+
+
+def print_summary(dataset: "TrajectoryDataset") -> None:
+    """Print what the dataset contains for each robot, and where it is."""
+    from wpt_agents.zoo.pictures.datasets import data_table
+    from wpt_agents.zoo.terminal import console
+
+    console.print(data_table(dataset))
+    typer.echo(f"Dataset: {dataset.path.resolve()}")

@@ -135,7 +135,7 @@ def declare(
     attributes: dict[str, Any] = {item.name: ProgressAttribute() for item in fields(progress)}
     attributes |= {name: KeywordAttribute() for name in keywords.declared()}
     for name, attribute in attributes.items():
-        attribute.__set_name__(agent, name)
+        attribute.__set_name__(agent, name)  # Python calls it only for attributes in a class's body
         setattr(agent, name, attribute)
     agent.__signature__ = signature(keywords, init)  # type: ignore[attr-defined]
     text = agent.__dict__.get("__doc__")

@@ -81,6 +81,7 @@ class ICMLearner(CuriousLearner):
             read, surprise = icm(batch.image, batch.action)
             loss = icm_loss(read, batch.action[:, 1:], surprise, within, icm.forward_share)
         self.descend(self.curiosity_optimizer, loss, "curiosity")
+        # seen first, so that the reward is in units that include this batch
         icm.scale.see(surprise[within])
         reward = torch.zeros_like(batch.reward)
         known = torch.zeros_like(batch.is_first)

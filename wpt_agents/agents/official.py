@@ -53,6 +53,7 @@ def import_model(
     check_shapes(model.policy, tensors, path)
     dynamics = {ours for part in WORLD_MODEL for _, ours in parameter_names(part)}
     heads = {name: tensors.pop(name) for name in tensors.keys() - dynamics}
+    # assigned below and not copied: the paper's model has 1.1 GB
     tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
     model.policy.load_state_dict(tensors, strict=False, assign=True)  # no second copy
     model.reset_task()  # draws the heads, and makes optimisers of the new tensors

@@ -81,7 +81,7 @@ class PackNetPolicy(DrQv2Policy):
         for name, weight in self.managed():
             owner = self.owner(name)
             owner.copy_(prune(weight, owner, task, tasks_left))
-            weight[owner == FREE] = 0
+            weight[owner == FREE] = 0  # so that the retraining learns without them
 
     @torch.no_grad()
     def redraw(self) -> None:
@@ -134,6 +134,7 @@ class PackNetLearner(DrQv2Learner):
 
 
 def _masked(policy: PackNetPolicy, name: str, trains: int, gradient: Tensor) -> Tensor:
+    # Adam moves no weight whose gradient was always zero.
     return gradient * (policy.owner(name) == trains)
 
 

@@ -9,7 +9,7 @@ import zstandard
 
 from wpt_agents.files.names import unknown_name
 
-JPEG_QUALITY = 95
+JPEG_QUALITY = 95  # of 100; about a fourth of the images' size
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ CODECS = {
     "jpeg": Codec(_to_jpeg, _from_jpeg, lossless=False),
     "raw": Codec(lambda images, vector: images.tobytes() + vector, lambda stored, size: stored),
     "zstd": Codec(
+        # 3 is zstd's own default level
         lambda images, vector: zstandard.ZstdCompressor(3).compress(images.tobytes() + vector),
         lambda stored, size: zstandard.ZstdDecompressor().decompress(stored),
     ),

@@ -38,6 +38,7 @@ def area_weights(old: int, new: int) -> Tensor:
     edges = torch.arange(new + 1, dtype=torch.float64) * old / new
     pixel = torch.arange(old, dtype=torch.float64)
     overlap = torch.minimum(edges[1:, None], pixel + 1) - torch.maximum(edges[:-1, None], pixel)
+    # computed in float64, so that the rows sum to 1 after rounding
     return (overlap.clamp(min=0) * new / old).float()
 
 

@@ -19,7 +19,7 @@ from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import load_arrays, save_arrays
 
-CHUNK = 4096
+CHUNK = 4096  # trajectories that are compared at a time
 
 
 class Retriever:

@@ -27,7 +27,7 @@ from wpt_agents.files.archive import sync_folder
 from wpt_agents.files.locks import lock, unlock
 
 BLOCK = 16  # steps; longer blocks compress little better and make sequences read more in vain
-SHARD_BYTES = 256 * 2**20
+SHARD_BYTES = 256 * 2**20  # a new file is begun at this size; a trajectory is never divided
 
 
 def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[memoryview]:

@@ -23,10 +23,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-IMAGE_SIZE = 64
+IMAGE_SIZE = 64  # pixels, as in the paper and in every Dreamer
 GLANCES = 51  # images of a trajectory that its background is the median of
 MOVED = 20  # grey levels of 255 by which a pixel that moves differs from the background
 TOLERANCE = 1e-5  # by which an action may overstep a limit, from rounding
+# the arrays of a batch, by the names of its fields
 STREAMS = ("image", "action", "reward", "is_first", "is_terminal", "reward_known")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-VERSION = 1
+VERSION = 1  # raised when the layout changes: older programs then refuse new files
 
 
 @contextmanager

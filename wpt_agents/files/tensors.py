@@ -41,6 +41,7 @@ def write_tensors(file: IO[bytes], tensors: Mapping[str, Tensor]) -> None:
         header[name] = {"dtype": NAMES[tensor.dtype], "shape": list(tensor.shape)}
         header[name]["data_offsets"] = [start, end]
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    # as the reference implementation pads, so that tensors begin at a multiple of 8
     text += b" " * (-len(text) % ALIGNMENT)
     file.write(len(text).to_bytes(8, "little"))
     file.write(text)
@@ -67,6 +68,7 @@ def read_tensors(file: IO[bytes], length: int) -> dict[str, Tensor]:
         fits = start == end and stop - start == math.prod(shape) * dtype.itemsize
         if not fits or stop > length - 8 - size or min(shape, default=0) < 0:
             raise ValueError(f"its header is inconsistent at {name!r}")
+        # read into its final place, so that no second copy is in memory
         memory = torch.empty(stop - start, dtype=torch.uint8)
         _filled(memory.numpy().data, file)
         tensors[name], end = memory.view(dtype).reshape(shape), stop

@@ -90,6 +90,7 @@ def _make_id(env_id: str) -> gym.Env:
     namespace = env_id.split("/")[0] if "/" in env_id and ":" not in env_id else None
     known = {spec.namespace for spec in gym.registry.values()}
     if namespace in REGISTERED_BY and namespace not in known:
+        # as `gym.make("module:id")` does, for names that are known
         import_module(REGISTERED_BY[namespace])
     try:
         made = maybe_make_env(env_id, verbose=0)
@@ -120,6 +121,7 @@ def _monitored(env: gym.Env, monitor: bool) -> gym.Env:
 def _side_by_side(envs: list[gym.Env]) -> VecEnv:
     if not envs:
         raise ValueError(f"An empty list has no environment: give {ACCEPTED}")
+    # two places of one list must not step the same simulator
     if len({id(env.unwrapped) for env in envs}) < len(envs):
         raise ValueError(
             "The list holds the same environment twice, whose episodes would mix: make one for "

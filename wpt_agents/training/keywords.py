@@ -184,7 +184,7 @@ class Keywords:
     def __post_init__(self) -> None:
         for item in fields(self):
             value = plain(getattr(self, item.name))
-            object.__setattr__(self, item.name, value)
+            object.__setattr__(self, item.name, value)  # the dataclass is frozen
             if value is not None or item.default is not None:
                 item.metadata["keyword"].check(item.name, value)
         for name in self.sizes_own:

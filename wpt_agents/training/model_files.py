@@ -49,6 +49,7 @@ def restore(
 def write_world_model(path: ModelPath, header: Mapping[str, Any], policy: BasePolicy) -> None:
     """Write encoder, RSSM and decoder alone, in bfloat16: a small file to share."""
     kept = tuple(f"world_model.{part}." for part in ("encoder", "rssm", "decoder"))
+    # half the size; float32 is restored when they are loaded
     weights = {k: w.bfloat16() for k, w in policy.state_dict().items() if k.startswith(kept)}
     write_model(path, header, {WORLD_MODEL: weights})
 

@@ -44,6 +44,7 @@ class Streams:
 
     def numpy(self, purpose: Purpose, counter: int) -> np.random.Generator:
         """Return NumPy's generator at the beginning of a stream."""
+        # a list of integers: NumPy mixes them, so that near seeds give independent streams
         return np.random.default_rng([self.seed, int(purpose), counter])
 
     def torch(self, purpose: Purpose, counter: int, device: device | str = "cpu") -> Generator:
@@ -64,4 +65,4 @@ class Streams:
 
 def torch_seed(rng: np.random.Generator) -> int:
     """Return a seed for torch's generators."""
-    return int(rng.integers(2**31))
+    return int(rng.integers(2**31))  # what every generator accepts as a seed

@@ -34,6 +34,7 @@ def retrieve_ids(
     :raises ValueError: no trajectory has that many actions
     """
     names = set(dataset.embodiments)
+    # The authors filter by action width alone, which mixes robots: cheetah and walker both have 6.
     known = settings.embodiment if settings.embodiment in names else None
     if settings.embodiment is not None and known is None and names != {None}:
         others = ", ".join(sorted(name for name in names if name))

@@ -115,7 +115,7 @@ class Episodes(ABC):
         """Warn once if actions lie outside the limits: they are clipped."""
         if self._warned_of_clipping or action.shape[1:] != low.shape or low.shape != high.shape:
             return
-        slack = 1e-3 * (high - low)
+        slack = 1e-3 * (high - low)  # rounding of what a robot measured is no reason to warn
         outside = ((action < low - slack) | (action > high + slack)).any(0)
         if outside.any():
             self._warned_of_clipping = True
@@ -195,7 +195,7 @@ def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
             f"the observations are {image.shape} {image.dtype}, not (N, H, W, 3) uint8 images; "
             "name the images' key, image_key (--image-key), or render the states first"
         )
-    if image.shape[1] < min(image.shape[2:]):
+    if image.shape[1] < min(image.shape[2:]):  # fewer rows than any other side: these are channels
         image = image.transpose(0, 2, 3, 1)
     _check_channels(image)
     return resize(_as_bytes(image)[..., -3:])

@@ -109,6 +109,7 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
         if name is None:
             raise ValueError(f"needs an array {image_key!r}; there are: {', '.join(table)}. {ask}")
         return name, ()
+    # the usual names come first; cameras are looked for only where there is none
     name = first(IMAGES, table)
     if name is not None and (name in pictures or name not in IMAGES[:3] or not pictures):
         return name, ()

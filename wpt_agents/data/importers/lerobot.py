@@ -36,6 +36,7 @@ class LeRobotEpisodes(Episodes):
         self._folder = Path(folder)
         self._info = json.loads(_text(self._folder / "meta" / "info.json"))
         version = str(self._info.get("codebase_version"))
+        # version 2 has a file for each episode, and other metadata
         if not version.startswith("v3."):
             raise ValueError(f"{folder} is of version {version}; convert it to v3.0 with lerobot")
         self._camera = self._choose(camera or self.image_key)
@@ -141,6 +142,7 @@ class LeRobotEpisodes(Episodes):
             columns = [n for n in names if n in (*usual, *self._actions, self._camera)]
             self._open = path, self._parquet.read_table(path, columns=columns)
         table = self._open[1]
+        # a file holds many episodes
         mine = np.flatnonzero(table["episode_index"].to_numpy() == row["episode_index"])
         return table.take(mine).sort_by("frame_index")
 

@@ -75,6 +75,7 @@ class MinariEpisodes(Episodes):
         chosen = np.asarray(self._leaf(actions, key, "action_key"))
         if not hasattr(space, "low"):
             raise ValueError(f"{self._name} has the actions {space}; they must be a Box")
+        # several keys become columns side by side, so each is made flat
         return chosen.reshape(len(chosen), -1), np.ravel(space.low), np.ravel(space.high)
 
     def _leaf(self, tree: Any, key: str | None, option: str) -> np.ndarray:

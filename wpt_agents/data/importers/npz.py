@@ -21,8 +21,10 @@ from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, first, natural
 from wpt_agents.data.importers.tables import TableEpisodes
 from wpt_agents.data.trajectory import Trajectory
 
+# of ExORL and URLB, of Dreamer, of others
 IMAGE_KEYS = ("observation", "image", "pixels")
 OTHERS = ("reward", "discount", "is_terminal", "is_first")
+# all that zipfile and NumPy raise on a damaged file
 FAULTS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError)
 
 
@@ -86,6 +88,7 @@ class NpzEpisodes(Episodes):
         keys = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
         arrays = arrays_of(file, keys)
         key = self._check(file, arrays)
+        # dm_env marks a terminal state by a discount of 0, and a time limit by 1
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         if self.done_key is not None:
             over = arrays[self.done_key]
@@ -173,6 +176,7 @@ class Member:
         version = np.lib.format.read_magic(self._stream)  # type: ignore[no-untyped-call]
         read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
         self.shape, fortran, self.dtype = read(self._stream)
+        # objects would need a pickle; rows of Fortran order are not adjacent
         if self.dtype.hasobject or fortran:
             raise ValueError(f"{name} is no plain array in C order")
         self._data = self._stream.tell()

@@ -17,7 +17,7 @@ from wpt_agents.data.importers.episodes import Episodes, as_images, needs, warn_
 from wpt_agents.data.importers.records import find_records, read_steps
 from wpt_agents.data.trajectory import Trajectory
 
-JPEG = b"\xff\xd8"
+JPEG = b"\xff\xd8"  # how every JPEG file begins
 # The parts of a dictionary of actions, in the order in which Open X-Embodiment's users put them
 # side by side: where the hand goes, how it turns, what the fingers do. Flags that end an episode
 # and motions of a wheeled base are no part of it.

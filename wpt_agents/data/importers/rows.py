@@ -66,6 +66,7 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
     edges = np.unique(np.concatenate([[0], ends, [rows]]).astype(int)).tolist()
     if shifted is None:
         shifted = "step_type" in names and _first_actions_are_empty(table, columns, edges)
+    # without a next image an episode's last action leads nowhere
     shortest = 1 if columns.next_image and not shifted else 2
     bounds = tuple((a, b) for a, b in pairwise(edges) if b - a >= shortest)
     return Cut(bounds, shifted, len(edges) - 1 - len(bounds))

@@ -48,6 +48,7 @@ class SB3Episodes(Episodes):
         self._limits = buffer.action_space.low, buffer.action_space.high
         self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
         first = buffer.pos if buffer.full else 0
+        # from the oldest on: a full ring begins where the next step would be written
         self._rows = (first + np.arange(buffer.size())) % buffer.buffer_size
         if self._overwritten and buffer.full:
             self._rows = self._rows[1:]  # the oldest holds the newest's next observation
@@ -87,6 +88,7 @@ class SB3Episodes(Episodes):
         else:
             last = self._images(buffer.next_observations)[rows[-1:], env]
             image = np.concatenate([image, last])
+            # a time limit is no terminal state
             over = buffer.dones[rows[-1], env] and not buffer.timeouts[rows[-1], env]
             terminated = bool(over)
         source = f"SB3 replay buffer, environment {env}, steps {start} to {stop - 1}"

@@ -164,3 +164,15 @@ def test_parts_that_are_shorter_than_a_batch_are_joined():
     model = agent(ClockEnv(ENDLESS), max_trajectory_length=2, **SCRATCH).learn(32)
     batch = model.replay_buffer.sample(3, 4, 4, np.random.default_rng(0))
     assert torch.isfinite(batch.reward).all() and batch.is_first[:, 0].all()
+
+
+def test_an_exploration_that_makes_no_update_says_so_and_the_remedy_works():
+    def explorer():
+        return ICMExplorer("WPTPolicy", ClockEnv(), **SETTINGS | SCRATCH | {"learning_starts": 500})
+
+    with pytest.warns(UserWarning, match=r"explore\(3\) made no update.*learning_starts=500.* 21"):
+        list(explorer().explore(3))
+    model = explorer()
+    model.learning_starts = 0
+    model.warmup_steps = 0
+    assert len(list(model.explore(3))) == 3 and model.updates == 1

@@ -10,6 +10,7 @@ in the imagination of its own world model.
 """
 
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -179,6 +180,14 @@ class Explorer(WPT):
                 self.progress.cut = 0
                 self.update_models()
             yield self.replay_buffer.trajectories[-1]
+        if self.num_timesteps and self.updates_per_step and not self.updates:
+            warnings.warn(
+                f"explore({episodes}) made no update, so that nothing steered it: none is made in "
+                f"the first learning_starts={self.learning_starts} steps, and it has collected "
+                f"{self.num_timesteps}. Explore more episodes, or set model.learning_starts = 0 "
+                "and model.warmup_steps = 0 before it",
+                stacklevel=2,
+            )
 
 
 class ICMExplorer(Explorer):

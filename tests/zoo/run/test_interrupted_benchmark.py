@@ -9,12 +9,10 @@ from pathlib import Path
 
 import pytest
 from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
-from engine_work import do_dot
 
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
-from wpt_agents.zoo.run import engines, runner
-from wpt_agents.zoo.run.engines import Resources, run_on
+from wpt_agents.zoo.run import runner
 
 pytestmark = pytest.mark.slow  # whole runs
 SEEDS = range(4)
@@ -111,14 +109,3 @@ def test_a_run_that_always_fails_leaves_the_others_and_is_named_with_its_log(
     assert [read_result(one.folder) is not None for one in jobs] == [True, False, True]
     assert "out of luck" in said and "error.txt" in said
     assert len(read_results(tmp_path)) == 2  # means are over two, and their number is shown
-
-
-def test_an_engine_ends_the_other_runs_and_names_the_one_that_fails(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(engines, "do", do_dot)
-    good, bad = (job(tmp_path, "scratch", seed) for seed in range(2))
-    bad.folder.mkdir(parents=True)
-    (bad.folder / "replay").write_text("a file where the run needs a folder")
-    (bad.folder / "checkpoints").write_text("and here")
-    assert not run_on("local", [good, bad], False, Resources(workers=1))
-    assert read_result(good.folder) is not None and read_result(bad.folder) is None
-    assert str(bad.folder.name) in capsys.readouterr().out

@@ -5,9 +5,11 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from wpt_agents.data.convert import Data
 from wpt_agents.files.official import (
     GATES,
     NORM_EPS,
@@ -36,7 +38,13 @@ class Undrawn(TorchFunctionMode):
 
 
 def import_model(
-    agent: Callable[..., Any], path: Path, stoch: int | None, lean: bool, **keywords: Any
+    agent: Callable[..., Any],
+    path: Path,
+    stoch: int | None,
+    lean: bool,
+    dataset: Data | None,
+    env: GymEnv | str | None,
+    **keywords: Any,
 ) -> Any:
     """Make an agent with the weights of the authors' file; see `WPT.from_official`.
 
@@ -59,6 +67,9 @@ def import_model(
     model.reset_task()  # draws the heads, and makes optimisers of the new tensors
     model.policy.load_state_dict(heads, strict=False)
     model.initialised = True  # the posterior is trained: not to be adapted to any data
+    model.set_dataset(dataset)
+    if env is not None:
+        model.set_env(env)
     return model
 
 

@@ -32,8 +32,6 @@ from wpt_agents.training.spaces import check_spaces
 class SavedAgent(KeywordAgent):
     """An SB3 algorithm that is made of a policy, a learner, keywords and counters.
 
-    `PixelAgent` adds how it collects and learns.
-
     :param policy: the policy's name or class; the first of `policy_aliases` if None
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
     :param dataset: trajectories to learn from: whatever `open_dataset` takes
@@ -70,11 +68,10 @@ class SavedAgent(KeywordAgent):
         self.progress = self.progress_class()
         seed = self.hyperparameters.seed
         self.streams = Streams(torch_seed(np.random.default_rng()) if seed is None else seed)
-        rate = getattr(self.hyperparameters, "learning_rate", 0.0)
         super().__init__(
             policy or next(iter(self.policy_aliases)),
             None,
-            learning_rate=rate,
+            learning_rate=getattr(self.hyperparameters, "learning_rate", 0.0),
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -199,7 +196,7 @@ class SavedAgent(KeywordAgent):
         :param exclude: accepted because SB3 has it; nothing optional is in the file
         :param include: likewise
         """
-        dataset = str(self.dataset.path) if self.dataset is not None else None
+        dataset = None if self.dataset is None else str(self.dataset.path)
         header = self.description() | {"dataset": dataset}
         model_files.write(path, header, self.policy, self.learner)
 
@@ -240,9 +237,8 @@ class SavedAgent(KeywordAgent):
             get_system_info()
         header, tensors = read_model(path)
         model_files.check_class(header, path, cls.saved_as or cls.__name__)
-        agent = cls(
-            device=device, _init_setup_model=False, **{**header["hyperparameters"], **kwargs}
-        )
+        keywords = {**header["hyperparameters"], **kwargs}
+        agent = cls(device=device, _init_setup_model=False, **keywords)
         agent.action_space = space_from_dict(header["action_space"])
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
@@ -263,9 +259,12 @@ class SavedAgent(KeywordAgent):
         """
         self._check_same(header, same)
         progress = self.progress_class.of(header["counters"])
+        self._load_tensors(tensors)
+        self.progress = progress
+
+    def _load_tensors(self, tensors: Mapping[str, Mapping[str, Tensor]]) -> None:
         self.fit_networks(tensors.get("policy", {}))
         model_files.restore(tensors, self.policy, self.learner)
-        self.progress = progress
 
     def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
         """Add or remove the networks that only some models have, before weights are loaded.
@@ -292,8 +291,7 @@ class SavedAgent(KeywordAgent):
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         self._check_same(header, self.shape_keywords)
-        self.fit_networks(tensors.get("policy", {}))
-        model_files.restore(tensors, self.policy, self.learner)
+        self._load_tensors(tensors)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""

@@ -246,11 +246,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
 
         :raises ValueError: no context, more actions than the model takes, images of another size
         """
-        if context < 1:
-            raise ValueError(
-                f"context, the number of images seen, must be at least 1, got {context}"
-            )
-        check_trajectory(trajectory, self.hyperparameters.max_action_dim)
+        check_trajectory(trajectory, self.hyperparameters.max_action_dim, context)
         with self.operations():
             return self.policy.open_loop(trajectory, context, horizon)
 
@@ -281,10 +277,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         cls.check_keywords(kwargs)
         lean = cls.make_policy is WorldModelAgent.make_policy  # explorers have further networks
-        model: Self = import_model(cls, path, stoch, lean, **kwargs)
-        model.set_dataset(dataset)
-        if env is not None:
-            model.set_env(env)
+        model: Self = import_model(cls, path, stoch, lean, dataset, env, **kwargs)
         return model
 
     def save_world_model(self, path: str | os.PathLike[str]) -> None:

@@ -245,16 +245,9 @@ class WPTPolicy(PixelPolicy):
         return {"reconstruction": loss.reconstruction.item(), "reward": error.item()}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "size": self.size,
-            "max_action_dim": self.max_action_dim,
-            "unimix": self.unimix,
-            "zero_init_heads": self.zero_init_heads,
-            "actor_outscale": self.actor_outscale,
-            "bin_range": self.bin_range,
-        }
+        names = ("observation_space", "action_space", "size", "max_action_dim", "unimix")
+        names += ("zero_init_heads", "actor_outscale", "bin_range")
+        return {name: getattr(self, name) for name in names}
 
 
 @op

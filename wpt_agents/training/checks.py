@@ -51,8 +51,10 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
         )
 
 
-def check_trajectory(trajectory: Trajectory, max_action_dim: int) -> None:
-    """Refuse a trajectory that a model cannot look at."""
+def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) -> None:
+    """Refuse a trajectory that a model cannot look at, or a context of no image."""
+    if context < 1:
+        raise ValueError(f"context, the number of images seen, must be at least 1, got {context}")
     if trajectory.image.shape[1:] != IMAGE_SHAPE:
         raise ValueError(f"The trajectory's images are {trajectory.image.shape[1:]}: resize to 64")
     if trajectory.action_dim > max_action_dim:

@@ -56,7 +56,7 @@ def test_a_loaded_model_acts_the_same(learnt, tmp_path):
 def test_a_loaded_model_has_the_same_settings_and_counters(learnt, tmp_path):
     learnt.save(tmp_path / "model.zip")
     loaded = WPT.load(tmp_path / "model.zip", gamma=0.9)
-    assert loaded.hyperparameters == learnt.hyperparameters.changed(gamma=0.9)
+    assert loaded.hyperparameters == learnt.hyperparameters.resolved().changed(gamma=0.9)
     assert loaded.gamma == 0.9 and loaded.num_timesteps == 28
     assert loaded.retrieved_ids == learnt.retrieved_ids and loaded.updates == learnt.updates
 

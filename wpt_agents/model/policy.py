@@ -245,8 +245,8 @@ class WPTPolicy(PixelPolicy):
         return {"reconstruction": loss.reconstruction.item(), "reward": error.item()}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("observation_space", "action_space", "size", "max_action_dim", "unimix")
-        names += ("zero_init_heads", "actor_outscale", "bin_range")
+        names = ["observation_space", "action_space", "size", "max_action_dim", "unimix"]
+        names += ["zero_init_heads", "actor_outscale", "bin_range"]
         return {name: getattr(self, name) for name in names}
 
 

@@ -11,6 +11,7 @@ import torch
 from typer.testing import CliRunner
 
 from wpt_agents.zoo import machine
+from wpt_agents.zoo.bench import threads as bench
 from wpt_agents.zoo.commands.app import app
 
 ROOT = Path(__file__).parents[3]
@@ -68,13 +69,19 @@ def test_the_zoo_lets_threads_wait_by_sleeping_unless_told_otherwise(policy, exp
     assert process.stdout.splitlines()[-1] == f"POLICY {expected} False", process.stderr
 
 
-@pytest.mark.slow
-def test_the_table_compares_threads_and_policies_with_and_without_a_neighbour():
+def test_the_table_compares_threads_and_policies_with_and_without_a_neighbour(monkeypatch):
+    monkeypatch.setattr(bench, "measured", lambda threads, policy, *_: threads + 0.5)
     ran = CliRunner().invoke(app, ["bench", "threads", "--quick", "--json"])
     assert ran.exit_code == 0, ran.output
     rows = [json.loads(line) for line in ran.stdout.splitlines()]
     cases = [(row["threads"] > 1, row["wait policy"], row["busy neighbours"] > 0) for row in rows]
-    variants = [(False, "default"), (True, "default"), (True, "passive")]
-    assert cases == [(*case, busy) for busy in (False, True) for case in variants]
-    assert all(row["updates_per_s"] > 0 for row in rows)
+    kinds = [(False, "default"), (True, "default"), (True, "passive")]
+    assert cases == [(*kind, busy) for busy in (False, True) for kind in kinds]
+    assert all(row["updates_per_s"] == row["threads"] + 0.5 for row in rows)
+
+
+@pytest.mark.slow
+def test_a_case_is_measured_in_a_process_of_its_own_beside_a_busy_one():
+    with bench.busy(1):
+        assert bench.measured(2, "passive", "debug", 2, 4, 0.2) > 0
     assert torch.get_num_threads() == 1  # this process is left alone

@@ -104,6 +104,27 @@ def test_code_in_markdown_is_not_prose():
     assert [number for number, line in prose(page) if BANNED.search(line)] == [5]
 
 
+def docstrings(code):
+    """The docstrings of a Python file."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def unset(docstring):
+    """What the site reads as unfinished markup: a code span that letters follow, or |x|."""
+    text = re.sub(r"^ {4}.*$", "", docstring, flags=re.M)  # without indented code
+    text = re.sub(r"`[^`]*`", "`", text)
+    return re.findall(r"`\w+", text) + re.findall(r"(?<![\w|])\|[^|\s]+\|(?!\|)", text)
+
+
+def test_the_site_can_set_every_docstring():
+    paths = [*ROOT.glob("wpt_agents/**/*.py"), *ROOT.glob("envs/**/*.py")]
+    found = {path: [unset(text) for text in docstrings(path.read_text())] for path in paths}
+    assert len(found) > 150 and not {path: every for path, every in found.items() if any(every)}
+    assert unset("Files of `tf.Example`s.") and unset("The loss is |x|.") and not unset("`|x|`")
+
+
 if __name__ == "__main__":
     for path in FILES:
         if not sys.argv[1:] or folder(path) in sys.argv[1:]:

@@ -237,7 +237,7 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
         return MRQLearner(self.policy, self.hyperparameters)
 
     def update(self, metrics: Metrics) -> None:
-        """Make one update on the replay; before every `sync_every`th, those of the encoder."""
+        """Make one update on the replay. Once in `sync_every` updates, the encoder's come first."""
         settings = self.hyperparameters
         if self.updates % settings.sync_every == 0:
             metrics["train/encoder_loss"].append(self._update_encoder())

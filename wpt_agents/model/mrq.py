@@ -149,7 +149,7 @@ def encoder_loss(
     target: Tensor,
     weights: tuple[float, float, float],
 ) -> Tensor:
-    """Sum over H steps of λ_d |m_z - z̄|² + λ_r CE(m_r, r) + λ_e (m_e - end)².
+    """Sum over H steps of `λ_d |m_z - z̄|² + λ_r CE(m_r, r) + λ_e (m_e - end)²`.
 
     The prediction of each step is the input of the next one. Steps behind the end of an episode
     count nothing.
@@ -184,9 +184,9 @@ def scaled_target(
 
 
 def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
-    """The prioritised approximation loss: δ²/2 up to |δ| = 1, |δ|^(1+α) / (1+α) beyond.
+    """The prioritised approximation loss: `δ²/2` up to `|δ| = 1`, `|δ|^(1+α) / (1+α)` beyond.
 
-    MR.Q draws transitions in proportion to max(|δ|, 1)^α and takes Huber's loss. On uniform draws
+    MR.Q draws transitions in proportion to `max(|δ|, 1)^α` and takes Huber's loss. On uniform draws
     this loss has the same expected gradient up to its scale (https://arxiv.org/abs/2007.06049), and
     there are no priorities to keep.
 
@@ -201,7 +201,7 @@ def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
 
 
 def actor_loss(q: Tensor, before_tanh: Tensor, weight: float = 1e-5) -> Tensor:
-    """-E[(Q_1 + Q_2) / 2] + λ |u|²: the second term keeps tanh(u) from saturating.
+    """`-E[(Q_1 + Q_2) / 2] + λ |u|²`: the second term keeps tanh(u) from saturating.
 
     :param q: (2, N), of the actor's actions
     :param before_tanh: (N, A), u

@@ -3,7 +3,7 @@
 #   make test       installs, then runs the tests
 #   make learn      the test that learns from scratch, three seeds of some minutes each
 # For contributors:
-#   make check      lint, types and the fast tests, in about three minutes
+#   make check      lint, types and the fast tests
 #   make format     formats the code and applies automatic fixes
 #   make lint       ruff, codespell and mypy
 #   make types      mypy alone

@@ -90,7 +90,8 @@ def _instead(env: Any) -> str:
     if hasattr(env, "action_spec") and hasattr(env, "physics"):
         return (
             "a dm_env: "
-            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array'))`"
+            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array', "
+            "render_kwargs={'height': 64, 'width': 64}))`"
         )
     return f"a {type(env).__name__}"
 

@@ -269,13 +269,13 @@ def test_pretraining_that_diverges_keeps_its_last_checkpoint(monkeypatch, tmp_pa
             raise_at_next_update()
 
     def raise_at_next_update():
-        loss = learner.world_model_update_loss
+        loss = world_model_learner.world_model_update_loss
 
         def spoilt(*args, **kwargs):
             parts, post = loss(*args, **kwargs)
             return parts._replace(total=parts.total * torch.nan), post
 
-        monkeypatch.setattr(learner, "world_model_update_loss", spoilt)
+        monkeypatch.setattr(world_model_learner, "world_model_update_loss", spoilt)
 
     with pytest.raises(FloatingPointError, match="world model loss is nan"):
         pretrained([recorded()], steps=6, run_dir=tmp_path, callback=damage)

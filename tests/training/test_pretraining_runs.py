@@ -37,6 +37,14 @@ def often(monkeypatch):
     monkeypatch.setattr(pretraining, "EVERY", 4)
 
 
+@pytest.fixture(autouse=True)
+def attended():
+    """Let Ctrl-C interrupt: a shell lets its background jobs ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def pretrain(run_dir=None, steps=7, **changes):
     return WPT.pretrain(DATA, steps=steps, run_dir=run_dir, **SETTINGS | changes)
 

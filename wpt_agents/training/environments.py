@@ -106,7 +106,8 @@ def _refuse_dm_env(env: Any) -> gym.Env:
     if hasattr(env, "physics"):
         raise ValueError(
             f"This {name} is a dm_env. Wrap it by Shimmy (pip install 'shimmy[dm-control]'): "
-            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array'))`"
+            "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array', "
+            "render_kwargs={'height': 64, 'width': 64}))`"
         )
     raise ValueError(
         f"This {name} is a dm_env. Write a gymnasium.Env around it, as Shimmy does for dm_control, "

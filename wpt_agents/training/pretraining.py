@@ -129,7 +129,8 @@ class Pretraining:
         agent = self.agent
         done = agent.progress.pretrain_steps
         if self.world.rank == 0:
-            if self.run_dir is not None and done >= self.steps:
+            # Equal counts are no mistake: the same call opens a finished model again.
+            if self.run_dir is not None and done > self.steps:
                 warnings.warn(
                     f"{self.run_dir} holds a model of {done} updates already, so that steps="
                     f"{self.steps} makes none: to train it further pass steps above {done}",

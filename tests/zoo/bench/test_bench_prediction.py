@@ -126,6 +126,7 @@ def test_a_montage_puts_each_image_into_its_row_and_column():
     assert (picture[4] == 255).all() and (picture[:, 4] == 255).all()
 
 
+@pytest.mark.filterwarnings("ignore:.* holds a model of 2 updates already")  # then an error
 def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = CliRunner().invoke(app, ["bench", "prediction", "--quick", "--json"])

@@ -196,7 +196,8 @@ class Moved(gym.ObservationWrapper):
 @pytest.mark.parametrize("env", [Moved(ClockEnv()), VecTransposeImage(clocks())])
 def test_images_may_come_channels_first(env):
     with warnings.catch_warnings(action="error"):
-        model = agent(env, offline_ratio=0, guidance=0).learn(14)
+        settings = {"offline_ratio": 0, "guidance": 0, "train_ratio": 2, "warmup_steps": 0}
+        model = agent(env, **settings).learn(14)
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
     evaluate_policy(model, env, 1, warn=False)
     ways = [

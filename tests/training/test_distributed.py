@@ -206,6 +206,7 @@ def torchrun(*words):
     return done
 
 
+@pytest.mark.nightly  # half a minute
 @pytest.mark.slow
 def test_processes_connect_again_after_they_parted_and_after_one_was_restarted():
     said = torchrun(

@@ -120,6 +120,7 @@ def test_the_other_cases_yield_rows():
     assert shares == sorted(shares, reverse=True) and sum(shares) < 1
 
 
+@pytest.mark.nightly  # half a minute
 def test_scaling_tells_the_cost_of_a_unit_and_draws_it(tmp_path):
     picture = tmp_path / "growth.png"
     arguments = ["bench", "scaling", "--quick", "--json", "--plot", str(picture)]
@@ -155,6 +156,7 @@ def test_the_memory_of_a_row_is_its_own():
         assert small < 20
 
 
+@pytest.mark.nightly  # half a minute
 def test_every_row_tells_the_memory():
     ran = CliRunner().invoke(app, ["bench", "profile", "--quick", "--json"])
     assert all(json.loads(line)["rss_mb"] > 0 for line in ran.stdout.splitlines())

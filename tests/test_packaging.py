@@ -60,11 +60,14 @@ def test_twine_accepts_both(built):
 
 
 @pytest.mark.nightly
-def test_the_wheel_contains_presets_references_and_templates(built):
+def test_the_wheel_contains_presets_references_models_and_templates(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    for path in [*(ROOT / "zoo").glob("*.yaml"), *(ROOT / "zoo" / "references").iterdir()]:
-        assert f"wpt_agents/zoo/presets/{path.relative_to(ROOT / 'zoo')}" in names
+    zoo = ROOT / "zoo"
+    folders = [zoo / name for name in ("references", "models", "sequences")]
+    for path in [*zoo.glob("*.yaml"), *(path for folder in folders for path in folder.iterdir())]:
+        assert f"wpt_agents/zoo/presets/{path.relative_to(zoo)}" in names
+    assert "wpt_agents/zoo/presets/models/metaworld-mid.zip" in names
     for path in (ROOT / "wpt_agents").rglob("*.jinja"):
         assert str(path.relative_to(ROOT)) in names
     assert {"wpt_agents/py.typed", "wpt_envs/py.typed"} <= names

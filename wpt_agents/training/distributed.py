@@ -100,8 +100,8 @@ class World:
             values = [everyone[name] for everyone in everyones]
             if any(value != values[0] for value in values):
                 raise ValueError(
-                    f"The processes differ in {name}, by rank: {values}. Give all the same call, "
-                    "with dataset and run_dir in folders that all of them see"
+                    f"The processes differ in {name}, by rank: {values}. Make the same call "
+                    "in each, with dataset and run_dir in folders that all of them see"
                 )
 
 

@@ -20,7 +20,7 @@ from wpt_agents.zoo.pictures.predictions import Curve, Strip, draw_curves, draw_
 from wpt_agents.zoo.statistics import bootstrap
 
 CONTEXT, HORIZON = 5, 40  # images filtered, then images predicted
-TOLD = (1, 5, 10, 20, 40)  # horizons of the table
+HORIZONS_SHOWN = (1, 5, 10, 20, 40)  # steps ahead, columns of the table
 SHOWN = (0, 5, 10, 20, 40)  # horizons of the strips; 0 is the last image filtered
 
 Predict = Callable[[Batch], np.ndarray]  # (B, T) windows -> (B, T, 64, 64, 3)
@@ -172,7 +172,7 @@ def row(robot: str, name: str, errors: np.ndarray, copied: np.ndarray) -> dict[s
         "robot": robot,
         "prediction": name,
         "episodes": len(errors),
-        **{f"+{h}": round(float(errors[:, h].mean()), 1) for h in TOLD},
+        **{f"+{h}": round(float(errors[:, h].mean()), 1) for h in HORIZONS_SHOWN},
         f"mean of 1 to {HORIZON}": round(float(mean), 1),
         "95 %": f"{low:.1f} to {high:.1f}",
         "minus copying": round(float(less), 1),

@@ -56,7 +56,7 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
 
 
 def run(job: Run, force: bool = False) -> Result:
-    """Do what is not done yet of a run and return its result."""
+    """Do the stages of a run that are not finished, and return its result."""
     check_folder(job, force)
     done = None if force else read_result(job.folder)
     if done is not None:

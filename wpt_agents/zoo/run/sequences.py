@@ -77,7 +77,7 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
 
 
 def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
-    """Do what is not done yet of a sequence and return its result."""
+    """Learn the tasks of a sequence that are not finished, and return its result."""
     done = None if force else read_sequence(job.folder)
     if done is not None and done.finished:
         say("sequence", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")

@@ -157,7 +157,7 @@ def test_a_task_begun_in_an_endless_episode_is_dropped_with_other_actions():
 
 def test_an_episode_of_an_earlier_query_image_is_remembered_behind_a_cut():
     model = agent(ClockEnv(ENDLESS), max_trajectory_length=4, train_ratio=0, **SCRATCH).learn(10)
-    assert (model.first_image() == 0).all()  # the episode's first, not that of its third part
+    assert (model.first_images(1) == 0).all()  # the episode's first, not that of its third part
 
 
 def test_parts_that_are_shorter_than_a_batch_are_joined():

@@ -226,6 +226,37 @@ def test_the_query_is_an_episodes_first_image_also_in_the_middle_of_one(store):
     assert model.learn(1, reset_num_timesteps=False).retrieved_ids == [2]
 
 
+def first_images(resets, seed):
+    env = DotEnv()
+    return [env.reset(seed=seed if i == 0 else None)[0] for i in range(resets)]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_several_first_images_find_an_episode_for_each_and_the_last_one_is_begun(store, n_envs):
+    action = np.zeros((1, 2), np.float32)
+    starts = first_images(3, seed=2)
+    with store:
+        store.extend(Trajectory(np.stack([image, image]), action) for image in starts)
+    model = pretrained(store, num_retrieve=3, retrieval_images=3)
+    model.set_env(DummyVecEnv([DotEnv] * n_envs))
+    model.env.seed(2)  # the second environment has the seed 3
+    model.learn(LENGTH * n_envs)
+    expected = {2, 7, 8} if n_envs == 1 else {2, 3, 7}  # with equal images, 6 comes after 2
+    assert set(model.retrieved_ids) == expected
+    begun = [trajectory.image[0] for trajectory in model.replay_buffer.trajectories]
+    resets = 3 if n_envs == 1 else 2
+    assert (begun[0] == starts[resets - 1]).all()
+
+
+def test_one_first_image_resets_nothing_and_in_an_episode_there_is_only_one(store):
+    model = pretrained(store, num_retrieve=1, env=DotEnv(), offline_ratio=0, guidance=0)
+    model.env.seed(2)
+    model.learn(LENGTH // 2)  # retrieves nothing
+    model.offline_ratio, model.retrieval_images = 0.5, 5
+    assert model.learn(LENGTH, reset_num_timesteps=False).retrieved_ids == [2]
+    assert (model.replay_buffer.trajectories[0].image[0] == first_images(1, 2)[0]).all()
+
+
 def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
     def retrieved(start, seed):
         model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)

@@ -33,6 +33,23 @@ def test_the_search_equals_brute_force_across_chunks(monkeypatch):
     np.testing.assert_allclose(distances, np.sort(distance)[:100], rtol=1e-4)
 
 
+def test_several_queries_take_their_nearest_in_turns_and_none_twice():
+    #  e(o_off)   D to 0   D to 10
+    #  0   0.5      0.5      9.5
+    #  1   2        2        8
+    #  2   1        1        9
+    #  3   10.2    10.2      0.2
+    #  4   5        5        5
+    # in turns: 3 (0.2), 0 (0.5); 2 (1), 4 (5); 1 (2), for 1 is the third of both
+    features = [[0.5], [2], [1], [10.2], [5]]
+    indices, distances = retriever(features).search(np.array([[0.0], [10.0]]), k=5)
+    assert indices.tolist() == [3, 0, 2, 4, 1]
+    np.testing.assert_allclose(distances, [0.2, 0.5, 1, 5, 2], rtol=1e-6)
+    assert retriever(features).search(np.array([[0.0], [10.0]]), k=3)[0].tolist() == [3, 0, 2]
+    one, two = (retriever(features).search(np.zeros(shape), k=3)[0] for shape in ((1,), (1, 1)))
+    assert one.tolist() == two.tolist() == [0, 2, 1]
+
+
 def test_the_share_of_the_nearest_that_are_of_ones_own_robot():
     # at 0, 1, 2 a walker; at 10, 11 an arm: of two others each, walkers find 2 of 2, arms 1 of 2
     places = np.array([[0.0], [1.0], [2.0], [10.0], [11.0]])

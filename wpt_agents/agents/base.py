@@ -205,13 +205,23 @@ class PixelAgent(SavedAgent):
         spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
         return getattr(spec, "max_episode_steps", None)
 
-    def first_image(self) -> np.ndarray:
-        """Return the first image of the first environment's open episode, (1, 64, 64, 3)."""
-        frame = to_images(self._last_obs)[0][0]
+    def first_images(self, number: int) -> np.ndarray:
+        """Return the first images of episodes, (number, 64, 64, 3).
+
+        One is that of the first environment's open episode. For more, all environments are reset
+        as often as it takes; in the middle of episodes, which a reset would cut, there is only one.
+        """
+        image: np.ndarray = np.asarray(to_images(self._last_obs)[0])
         if self.rollout is not None and not self._last_episode_starts.all():
             opening = self.rollout.first_image(0)
-            frame = frame if opening is None else opening
-        return np.asarray(frame)[None]
+            return image[:1] if opening is None else opening[None]
+        assert self.env is not None
+        images = [image]
+        while number > len(images) * self.n_envs:
+            self._last_obs = self.env.reset()
+            images.append(np.asarray(to_images(self._last_obs)[0]))
+        together: np.ndarray = np.concatenate(images)
+        return together[:number]
 
     def _open_rollout(self) -> Rollout:
         """Return the open episodes; new ones if all environments were just reset."""

@@ -169,7 +169,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             return
         kept = self.kept.trajectories if self.kept is not None else []
         if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
-            query = self.policy.embed(self.first_image())[0]
+            query = self.policy.embed(self.first_images(settings.retrieval_images))
             index = self.build_index(progress_bar)
             if kept:
                 index = with_kept(index, kept, self.policy.embed)

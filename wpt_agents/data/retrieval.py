@@ -116,12 +116,16 @@ class Retriever:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Eq. (5): D = ||e(o_on) - e(o_off)||_2, the `k` nearest, each trajectory once.
 
-        :param embed: (E,), the features of the task's first observation
+        :param embed: (E,), the features of the task's first observation, or (Q, E), those of the
+            first observations of Q episodes, which take their nearest trajectories in turns
         :param embodiment: only trajectories of this name, or of none
         :param action_dim: only trajectories of this action width
-        :return: indices (k',) and distances (k',), nearest first; k' < k if there are no more
+        :return: indices (k',) and distances (k',) to the query that found each, nearest first (of
+            several queries: all that are a query's nearest, then all second ones, and so on);
+            k' < k if there are no more
         """
-        if embed.shape != self.features.shape[1:]:
+        queries = np.ascontiguousarray(np.atleast_2d(embed), np.float32)
+        if queries.ndim != 2 or queries.shape[1:] != self.features.shape[1:]:
             raise ValueError(
                 f"The query has shape {embed.shape}, the index holds features of "
                 f"{self.features.shape[1:]}; embed one observation with the index's encoder"
@@ -131,15 +135,18 @@ class Retriever:
             return np.zeros(0, np.int64), np.zeros(0, np.float32)
         import faiss
 
-        query, nearest = np.ascontiguousarray(embed[None], np.float32), []
+        nearest = []
         for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
             chunk = candidates[at : at + CHUNK]
             # exact search, as the authors' IndexFlatL2
-            squared, near = faiss.knn(query, self.features[chunk], min(k, len(chunk)))
-            nearest.append((chunk[near[0]], squared[0]))
-        indices, squared = (np.concatenate(parts) for parts in zip(*nearest, strict=True))
-        order = np.lexsort((indices, squared))[:k]  # equally near: in the dataset's order
-        return indices[order], np.sqrt(squared[order])
+            squared, near = faiss.knn(queries, self.features[chunk], min(k, len(chunk)))
+            nearest.append((chunk[near], squared))
+        indices, squared = (np.concatenate(parts, 1) for parts in zip(*nearest, strict=True))
+        order = np.lexsort((indices, squared))[:, :k]  # equally near: in the dataset's order
+        indices = np.take_along_axis(indices, order, 1)
+        squared = np.take_along_axis(squared, order, 1)
+        indices, squared = in_turns(indices, squared, k)
+        return indices, np.sqrt(squared)
 
     def draw(
         self,
@@ -202,3 +209,17 @@ class Retriever:
             )
         labels = arrays["action_dims"], head["embodiments"]
         return cls(arrays["features"], *labels, encoder_id, head.get("dataset_id", ""))
+
+
+def in_turns(indices: np.ndarray, squared: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Merge the answers to several queries: first all nearest ones, then all second ones, ...
+
+    :param indices: (Q, N), a row for each query, nearest first
+    :param squared: (Q, N), the squared distances of these
+    :return: at most `k` indices, none twice, and their squared distances
+    """
+    rank = np.broadcast_to(np.arange(indices.shape[1]), indices.shape)
+    order = np.lexsort((indices.ravel(), squared.ravel(), rank.ravel()))
+    first = np.unique(indices.ravel()[order], return_index=True)[1]  # where each occurs first
+    chosen = order[np.sort(first)[:k]]
+    return indices.ravel()[chosen], squared.ravel()[chosen]

@@ -280,6 +280,13 @@ class Hyperparameters(Keywords):
         '"nearest", by Eq. (5), or "random", its ablation',
         Stage.RETRIEVAL,
     )
+    retrieval_images: int = count(
+        1,
+        "first images of the task that Eq. (5) compares; each finds its nearest trajectories in "
+        "turn. Above 1 the environment is reset that often before anything is collected, and "
+        "retrieval confuses fewer tasks that look alike",
+        Stage.RETRIEVAL,
+    )
     bc_steps: int | None = count(
         None,
         "updates of the prior actor; the size's own if None, which is 150,000 for `paper`",

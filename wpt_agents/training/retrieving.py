@@ -29,7 +29,7 @@ def retrieve_ids(
     Only trajectories with as many actions as the task are found, and if the dataset names the
     task's robot, only those of this robot or of none.
 
-    :param query: (E,), e(o) of the task's first image
+    :param query: (Q, E), e(o) of the first images of Q episodes of the task
     :param width: the number of actions
     :raises ValueError: no trajectory has that many actions
     """

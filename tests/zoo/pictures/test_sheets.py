@@ -101,6 +101,25 @@ def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, mon
     assert (30, 30, 30) in colours(tmp_path / "found.png")
 
 
+def test_the_share_of_the_own_task_counts_what_the_index_finds(tmp_path, monkeypatch, capsys):
+    env = gym.make("wpt/metaworld-reach-v0", rendering="fast")
+    action = np.zeros((4, 4), np.float32)
+    with TrajectoryDataset.create(tmp_path / "data") as dataset:
+        for seed, task in ((0, "reach"), (1, "push"), (2, "reach")):
+            image = env.reset(seed=seed)[0]
+            name = f"wpt/metaworld-{task}-v0"
+            dataset.append(Trajectory(np.stack([image] * 5), action, task=name))
+    agent(DotEnv()).save(tmp_path / "model.zip")
+    words = ["--model", tmp_path / "model.zip", "--task", "reach", "--rendering", "fast"]
+    words += ["--images", 1, "--images", 2, "--number", 2, "--seed", 1]
+    assert call(monkeypatch, "retrieve", "share", tmp_path / "data", *words) == 0
+    # seeds 1 and 2 find the second and the third; seed 1 alone finds the second and another
+    assert capsys.readouterr().out.split("\n")[1].split() == ["reach", "0.50", "0.50"]
+    words += ["--number", 1, "--seed", 2]
+    assert call(monkeypatch, "retrieve", "share", tmp_path / "data", *words) == 0
+    assert capsys.readouterr().out.split("\n")[1].split() == ["reach", "1.00", "1.00"]
+
+
 def test_datasets_are_checked_and_joined_from_a_terminal(tmp_path, monkeypatch, capsys):
     for name in ("one", "two"):
         with TrajectoryDataset.create(tmp_path / name) as dataset:

@@ -10,7 +10,12 @@ import typer
 
 from wpt_agents.zoo.commands.importing import import_data, print_summary
 from wpt_agents.zoo.commands.options import Rendering, Spaced, Suite, Tasks, Workers
-from wpt_agents.zoo.commands.retrieval import Picture, retrieve, show_retrieval
+from wpt_agents.zoo.commands.retrieval import (
+    Picture,
+    retrieve,
+    share_retrieval,
+    show_retrieval,
+)
 
 if TYPE_CHECKING:
     pass
@@ -28,6 +33,7 @@ def register(app: typer.Typer) -> None:
     data.command("merge")(merge_data)
     app.add_typer(data, name="data")
     retrieve.command("show", cls=Spaced)(show_retrieval)
+    retrieve.command("share", cls=Spaced)(share_retrieval)
     app.add_typer(retrieve, name="retrieve")
 
 

@@ -1,4 +1,4 @@
-"""The command that shows what retrieval finds: retrieve show."""
+"""The commands that show what retrieval finds: retrieve show, share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -59,3 +59,34 @@ def show_retrieval(
     results = [retrieval.search(agent, item, number, own_robot) for item in queries]
     retrieval.retrieval_sheet(out, agent.dataset, results)
     typer.echo(f"Retrieval sheet: {out.resolve()}")
+
+
+def share_retrieval(
+    folder: Annotated[Path, typer.Argument(help="The folder of a dataset that names its tasks.")],
+    model: Annotated[
+        str, typer.Option(help="The model, a file or a name, whose encoder compares the images.")
+    ],
+    task: Annotated[list[str], typer.Option(help="Tasks whose first images to search for.")],
+    suite: Suite = "metaworld",
+    rendering: Annotated[
+        Rendering, typer.Option(help="The quality of the images of the tasks.")
+    ] = Rendering.near,
+    number: Annotated[int, typer.Option(min=1, help="The number of retrieved trajectories.")] = 40,
+    images: Annotated[
+        list[int], typer.Option(min=1, help="How many first images of the task are compared.")
+    ] = [1, 5, 10, 20, 40],  # noqa: B006
+    seed: Annotated[int, typer.Option(help="The seed of the first episode.")] = 0,
+) -> None:
+    """Print the share of retrieved trajectories that are of the task, by number of first images.
+
+    Example: `python -m wpt_agents.zoo retrieve share data/mw --model metaworld-mid --task reach`
+    """
+    from wpt_agents.agents.wpt import WPT
+    from wpt_agents.zoo.judge.retrieved import own_task_shares
+    from wpt_agents.zoo.tasks import find_tasks
+
+    agent = WPT.load(model, dataset=folder)
+    look = {"rendering": str(rendering)}
+    typer.echo(f"{'first images':28}" + "".join(f"{count:7}" for count in images))
+    for name, shares in own_task_shares(agent, find_tasks(suite, task), images, number, look, seed):
+        typer.echo(f"{name:28}" + "".join(f"{share:7.2f}" for share in shares))

@@ -163,6 +163,14 @@ def test_links_lead_somewhere(name):
         assert (path.parent / target).exists(), target
 
 
+@pytest.mark.parametrize("name", ["../README.md", *PAGES])
+def test_no_table_is_broken_by_an_empty_line(name):
+    text = re.sub(r"```.*?```", "", (ROOT / "docs" / name).read_text(), flags=re.S)
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = table.splitlines()
+        assert len(rows) > 2 and re.fullmatch(r"\|( ?-+ ?\|)+", rows[1]), table
+
+
 def test_the_versions_in_the_results_lie_within_the_bounds():
     packaging = import_module("packaging.specifiers")
     project = (ROOT / "pyproject.toml").read_text()

@@ -1,6 +1,9 @@
 """The tutorials: every notebook is listed and runs from top to bottom at a small size."""
 
+import ast
+import json
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,16 @@ def test_every_notebook_is_listed():
     assert names and sorted(set(re.findall(r"\((\S+\.ipynb)\)", page))) == names
     toctree = re.search(r"```{toctree}\n:hidden:\n(.*?)```", page, re.S)[1].split()
     assert toctree == [name.removesuffix(".ipynb") for name in names]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_a_notebook_imports_of_the_library_exists(path):
+    cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    code = re.sub(r"^!.*$", "", "\n".join("".join(cell["source"]) for cell in cells), flags=re.M)
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("wpt_"):
+            for alias in node.names:
+                assert hasattr(import_module(node.module), alias.name), (node.module, alias.name)
 
 
 @pytest.mark.nightly

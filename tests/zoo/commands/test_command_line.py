@@ -63,3 +63,42 @@ def test_an_error_is_one_sentence_and_debug_shows_where(
     assert call(monkeypatch, "eval", tmp_path, "--debug") == code
     shown = capsys.readouterr().err
     assert shown.startswith("Traceback") and shown.endswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["rum"],
+            "No such command 'rum'. Did you mean 'run'? (see python -m wpt_agents.zoo --help)",
+        ),
+        (["run", "--fram", "9"], "(see python -m wpt_agents.zoo run --help)"),
+        (["run", "--tasks"], "Option '--tasks' requires an argument (see "),
+        (["collect"], "Missing option '--out' (see python -m wpt_agents.zoo collect --help)"),
+        (
+            ["bench", "--precision", "fp8"],
+            "'fp8' is not one of 'fp32', 'bf16' (see python -m wpt_agents.zoo bench",
+        ),
+        (
+            ["data", "shw"],
+            "Did you mean 'show'? (see python -m wpt_agents.zoo data --help)",
+        ),
+    ],
+)
+def test_a_wrong_word_ends_in_one_sentence(words, sentence, monkeypatch, capsys):
+    assert call(monkeypatch, *words) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("Error: ") and printed.err.count("\n") == 1
+    assert sentence in printed.err and printed.out == ""
+
+
+def test_a_group_without_a_command_shows_its_help(monkeypatch, capsys):
+    assert call(monkeypatch, "data") == 2
+    printed = capsys.readouterr()
+    assert "validate" in printed.out and printed.err == ""
+
+
+def test_ctrl_c_ends_in_one_sentence(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("wpt_agents.zoo.judge.trained.find_trained", fail(KeyboardInterrupt()))
+    assert call(monkeypatch, "eval", tmp_path) == 130
+    assert capsys.readouterr().err.count("Interrupted. The same command continues") == 1

@@ -34,7 +34,9 @@ Three commands to start with:
 
 All commands: python -m wpt_agents.zoo --help. About one: python -m wpt_agents.zoo run --help.
 """
+PROGRAM = "python -m wpt_agents.zoo"
 DEBUG = "--debug"
+INTERRUPTED = 130  # the exit code of a command that Ctrl-C ended; typer returns it, too
 
 app = typer.Typer(
     add_completion=False,
@@ -78,22 +80,29 @@ def main() -> None:
     """
     words = [word for word in sys.argv[1:] if word != DEBUG]
     try:
-        app(words)
+        code = app(words, prog_name=PROGRAM, standalone_mode=False)  # typer raises its errors
     except KeyboardInterrupt:
-        typer.echo("Interrupted. The same command continues from the finished stages.", err=True)
-        sys.exit(130)
+        code = INTERRUPTED
     except Exception as error:
         if len(words) < len(sys.argv) - 1:
             traceback.print_exc()
         message, code = explain(error)
-        typer.secho(f"Error: {message}", fg="red", err=True)
-        sys.exit(code)
+        if message:  # typer has none where it has shown the help of a group such as `data`
+            typer.secho(f"Error: {message}", fg="red", err=True)
+    if code == INTERRUPTED:
+        typer.echo("Interrupted. The same command continues from the finished stages.", err=True)
+    sys.exit(code or 0)
 
 
 def explain(error: Exception) -> tuple[str, int]:
     """Return the sentence that describes an error, and the exit code."""
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("wpt_"):
         return f'{error.name} is not installed: pip install "wpt-agents[all]"', 2
+    if hasattr(error, "format_message"):  # typer's, of a wrong option or value
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else PROGRAM
+        sentence = error.format_message().replace("Value error, ", "").rstrip(".")
+        return sentence and f"{sentence} (see {command} --help)", 2
     if isinstance(error, (ValueError, OSError)):
         return str(error), 2
     kind = type(error).__name__

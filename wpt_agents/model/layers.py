@@ -123,6 +123,13 @@ class Head(nn.Module):
         return out
 
 
+def scale_gradient(x: Tensor, weight: float) -> Tensor:
+    """Return x, whose gradient is multiplied by `weight`; 0: detached."""
+    if weight == 0:
+        return x.detach()
+    return x if weight == 1 else weight * x + (1 - weight) * x.detach()
+
+
 @contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
     """Let gradients pass through these modules without reaching their parameters."""

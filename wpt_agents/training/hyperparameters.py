@@ -210,6 +210,11 @@ class Hyperparameters(Keywords):
         "the paper",
     )
 
+    reward_grad: float = amount(
+        0.0,
+        "weight of the reward loss in the training of the world model. At 0, as in the paper, "
+        "states hold only what reconstructing images needs; DreamerV3 has 1",
+    )
     reward_ensemble: int = count(
         1, "reward heads. Of several, dreams are paid the mean, less what `pessimism` takes off"
     )

@@ -10,6 +10,7 @@ from torch.optim import Optimizer
 import wpt_agents.fast  # noqa: F401  # registers the faster twins of what the model defines
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.dreamer_v3 import continue_loss
+from wpt_agents.model.layers import scale_gradient
 from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.rssm import Latent
 from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_model_update_loss
@@ -73,7 +74,10 @@ class WorldModelLearner:
     def update_world_model(
         self, batch: Batch, generator: Generator, learn_reward: bool = False
     ) -> tuple[Latent, Metrics]:
-        """Take a step on Eq. (1), and on the reward likelihood of states that it leaves alone.
+        """Take a step on Eq. (1), and on the reward likelihood.
+
+        The likelihood trains the reward head and, by the weight `reward_grad`, the states: not at
+        all in the paper (Algorithm 1, r_ξ).
 
         :return: the posterior states (B, T, ...), without gradient
         """
@@ -83,7 +87,8 @@ class WorldModelLearner:
             loss, post = world_model_update_loss(model, batch, generator, **self.eq_1_options)
             total = loss.total
             if learn_reward:
-                logits = model.reward_head(post.feat.detach())
+                feat = scale_gradient(post.feat, self.hyperparameters.reward_grad)
+                logits = model.reward_head(feat)
                 reward = reward_loss(logits, batch.reward, batch.reward_known, model.bin_range)
                 total = total + reward
                 metrics["train/reward_loss"] = reward.detach()

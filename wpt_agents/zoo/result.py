@@ -108,6 +108,11 @@ class Score:
     returns: tuple[float, ...]
     successes: tuple[bool, ...] = ()
 
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Self:
+        """Read a score from a JSON object; what can be computed from the episodes is not read."""
+        return cls(tuple(stored["returns"]), tuple(stored["successes"]))
+
     @property
     def mean(self) -> float:
         """The mean return."""
@@ -223,7 +228,7 @@ def write_result(folder: Path, result: Result) -> None:
 
 def read_score(path: Path) -> Score | None:
     """Read the score in a file of its own, None if there is no such file."""
-    return _score(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+    return Score.of(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
 
 def write_score(path: Path, score: Score) -> None:
@@ -246,10 +251,6 @@ def _score_json(score: Score) -> dict[str, Any]:
     return {"returns": list(score.returns), "successes": list(score.successes), **computed}
 
 
-def _score(stored: Mapping[str, Any]) -> Score:
-    return Score(tuple(stored["returns"]), tuple(stored["successes"]))
-
-
 def _from_json(stored: dict[str, Any]) -> Result:
     """Build a result from a file of this version or of version 0.1.
 
@@ -261,7 +262,7 @@ def _from_json(stored: dict[str, Any]) -> Result:
         variant = Variant(stored.pop("preset"), changes, stored.pop("data"))
     else:
         variant = Variant.parse(stored.pop("preset"))
-    scores = {name: _score(score) for name, score in stored.pop("scores").items()}
+    scores = {name: Score.of(score) for name, score in stored.pop("scores").items()}
     names = {"WPT": LAST}
     if "WPT, last" in scores:
         names = {"WPT, last": LAST, "WPT": BEST}

@@ -121,8 +121,5 @@ def read_sequence(folder: Path) -> SequenceResult | None:
 
 
 def _row(stored: dict[str, Any]) -> Row:
-    scores = {
-        task: Score(tuple(score["returns"]), tuple(score["successes"]))
-        for task, score in stored.pop("scores").items()
-    }
+    scores = {task: Score.of(score) for task, score in stored.pop("scores").items()}
     return Row(scores=scores, **stored)

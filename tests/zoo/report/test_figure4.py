@@ -25,11 +25,12 @@ def make_sequence(out, method, returns, seed=0, evaluated=True):
             arrays = {
                 "timesteps": np.array([50, 100]),
                 "results": np.array([[1.0], [returns[k][k]]]),
+                "ep_lengths": np.full((2, 1), 10),
             }
             np.savez(folder / task / "evaluations.npz", **arrays)
         else:
             lines = ["#{}", "r,l,t", *(f"{value}.0,10,1" for value in range(25))]
-            (folder / task / "0.monitor.csv").write_text("\n".join(lines), encoding="utf-8")
+            (folder / task / "0.monitor.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
     (folder / "config.yaml").write_text("task: ant", encoding="utf-8")
     result = SequenceResult(
         "dmc", "ant", method, Variant("tiny"), seed, list(TASKS), 400, 200, rows, "0123"

@@ -11,7 +11,7 @@ from zoo_command import call
 
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.runner import run
-from wpt_agents.zoo.run.watch import clock, overview, read_monitor, speed, standing
+from wpt_agents.zoo.run.watch import clock, overview, speed, standing
 
 HEAD = '#{"t_start": 1.0}\nr,l,t\n'
 
@@ -40,14 +40,6 @@ def test_a_run_goes_from_waiting_to_finished(tmp_path, one):
     assert standing(one).state == "failed"
     (one.folder / "result.json").write_text("{}")
     assert standing(one).state == "finished"
-
-
-def test_a_line_half_written_is_left_for_later(tmp_path):
-    path = tmp_path / "0.monitor.csv"
-    path.write_text(HEAD + "3.0,25,10.0\n5.0,2")
-    assert [column.tolist() for column in read_monitor(path)] == [[25], [3], [10]]
-    path.write_text("#")
-    assert len(read_monitor(path)[0]) == 0
 
 
 def test_speed_counts_since_the_process_began_again():

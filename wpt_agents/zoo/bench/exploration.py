@@ -18,11 +18,11 @@ import numpy as np
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS
 from wpt_agents.files.names import unknown_name
-from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions
+from wpt_agents.zoo.collect.behaviours import noise_actions, random_actions
 from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY, record
 from wpt_agents.zoo.collect.state_curiosity import (
     STEPS,
-    StatePolicy,
+    by_state,
     explore_states,
     state_policy,
 )
@@ -89,11 +89,6 @@ def explore(behaviour: str, seed: int, episodes: int, **settings: Any) -> np.nda
                     act = actions[behaviour](rng, 6, 500)[0]
                 record(env, act, int(rng.integers(2**31)))
         return np.stack(env.states)
-
-
-def by_state(policy: StatePolicy, rng: np.random.Generator) -> Act:
-    """Return a policy that sees the simulator's state as what plays an episode."""
-    return lambda obs, info, step: policy(info["state"], rng)
 
 
 def rows(

@@ -70,9 +70,9 @@ def rows(
             for one in learners
         ]
         measured = measured_in_turn(cases, 1 if quick else REPETITIONS)
-        for one, row in zip(learners, measured, strict=True):
-            ratio = row["median_s"] / measured[0]["median_s"]
-            yield row | {"imagined": i * one.imagined, "ratio_to_ours": ratio}
+        medians = [row["median_s"] for row in measured]
+        for one, row, median in zip(learners, measured, medians, strict=True):
+            yield row | {"imagined": i * one.imagined, "ratio_to_ours": median / medians[0]}
 
 
 def ours(model: WPT, batch: Batch) -> Learner:

@@ -33,6 +33,12 @@ EPISODES, STEPS, NEAREST, QUERIES = 20, 2000, 10, 10
 MODEL: dict[str, Any] = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
 PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
 
+# A suite, the column of its share, and the column of what a random choice would have.
+COLUMNS = (
+    ("dmc", "own robot, DMControl", "by chance"),
+    ("metaworld", "own task, Meta-World", "by chance "),  # a name of its own: columns are keys
+)
+
 Embed = Callable[[np.ndarray], np.ndarray]  # (n, 64, 64, 3) uint8 -> (n, E) float32
 
 
@@ -82,20 +88,17 @@ def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> 
     """How many of the k nearest are of the query's own robot (DMControl) or task (Meta-World)."""
     retriever = Retriever.build(dataset, embed, "bench")
     robots, tasks = np.array(dataset.embodiments), np.array(dataset.tasks)
-    hits: dict[str, list[float]] = {"dmc": [], "metaworld": []}
-    chance: dict[str, list[float]] = {"dmc": [], "metaworld": []}
+    hits: dict[str, list[float]] = {suite: [] for suite, *_ in COLUMNS}
+    chance: dict[str, list[float]] = {suite: [] for suite, *_ in COLUMNS}
     for task, feature in zip(asked.task, embed(asked.image), strict=True):
         row = TASKS[task]
         same = robots == row.embodiment if row.suite == "dmc" else tasks == task
         hits[row.suite].append(float(same[retriever.search(feature, k)[0]].mean()))
         chance[row.suite].append(float(same.mean()))
-    return {
-        "queries": len(asked.task),
-        "own robot, DMControl": _mean(hits["dmc"]),
-        "by chance": _mean(chance["dmc"]),
-        "own task, Meta-World": _mean(hits["metaworld"]),
-        "by chance ": _mean(chance["metaworld"]),
-    }
+    columns: dict[str, Any] = {"queries": len(asked.task)}
+    for suite, own, by_chance in COLUMNS:
+        columns |= {own: _mean(hits[suite]), by_chance: _mean(chance[suite])}
+    return columns
 
 
 def _mean(values: list[float]) -> float | None:

@@ -46,7 +46,7 @@ def plot(measured: list[dict[str, Any]], path: Path) -> None:
     """A picture of `rows`: a panel an axis, a line for each kind of step; flat is proportional."""
     from matplotlib.figure import Figure
 
-    axes = [name for name in UNITS if any(row["grows"] == name for row in measured)]
+    axes = [name for name in UNITS if _lines(measured, name)]
     figure = Figure(figsize=(3.4 * len(axes), 3.2), layout="constrained")
     for name, panel in zip(axes, figure.subplots(1, len(axes), squeeze=False)[0], strict=True):
         for label, points in _lines(measured, name).items():

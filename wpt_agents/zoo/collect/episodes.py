@@ -17,7 +17,7 @@ from gymnasium import spaces
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
-from wpt_agents.zoo.collect.state_curiosity import STAGES, stage_files, state_policy
+from wpt_agents.zoo.collect.state_curiosity import STAGES, by_state, stage_files, state_policy
 
 STATE_CURIOSITY = "explore-state"  # the behaviour of `state_curiosity`
 SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
@@ -131,7 +131,7 @@ def _actions(
         stage = episode % STAGES
         explorer = state_policy(stage_files(Path(recipe.stages), task)[stage].read_bytes())
         name = f"curiosity on the state, stage {stage + 1} of {STAGES}"
-        return lambda obs, info, step: explorer(info["state"], rng), name
+        return by_state(explorer, rng), name
     if recipe.behaviour == "random":
         return random_actions(rng, width, MAX_STEPS)
     if recipe.behaviour == "scripted" and has_script(task):

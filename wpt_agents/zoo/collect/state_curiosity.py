@@ -29,6 +29,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch import Tensor, nn
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.collect.behaviours import Act
 
 STEPS = 100_000  # calls of `env.step` that an exploration lasts
 STAGES = 5  # policies that are kept of it, at equal distances
@@ -202,6 +203,11 @@ def write_stages(
     for file, weights in zip(files, stages, strict=True):
         with replacing(file) as temporary:
             temporary.write_bytes(weights)
+
+
+def by_state(policy: StatePolicy, rng: np.random.Generator) -> Act:
+    """Return a policy that sees the simulator's state as what plays an episode."""
+    return lambda obs, info, step: policy(info["state"], rng)
 
 
 def state_policy(weights: bytes) -> StatePolicy:

@@ -128,7 +128,7 @@ def pretrain_model(
 
     check_device(device)
     chosen = load_preset(suite, preset, settings)
-    choose_threads(chosen.wpt.get("size", "paper"))
+    choose_threads(chosen.size)
     shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
     with joined(local_device(device)) as world:
         console.quiet = world.rank > 0

@@ -11,6 +11,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.sizes import Size
+from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
 
 EXPLORATION_KEYWORDS = ("steps",)  # of `collect --behaviour explore-state`
@@ -167,6 +169,11 @@ class Preset:
     def steps(self) -> int:
         """The calls of `env.step` that `learn.frames` simulator frames make."""
         return self.learn.frames // self.env.action_repeat
+
+    @property
+    def size(self) -> str | Size | Mapping[str, Any]:
+        """The size of WPT's networks."""
+        return Hyperparameters.of(self.wpt).size
 
     def as_dict(self) -> dict[str, Any]:
         """Plain dictionaries and lists, as `config.yaml` shows them."""

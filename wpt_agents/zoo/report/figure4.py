@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from wpt_agents.files.names import counted
+from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.report import figures
 from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
@@ -134,14 +135,12 @@ def _curve(folder: Path, result: SequenceResult, task: str) -> tuple[np.ndarray,
     They are the evaluations, or means of training episodes if there are none.
     """
     repeat = result.frames / result.steps
-    path = folder / task / "evaluations.npz"
-    if path.exists():
-        with np.load(path) as arrays:  # no pickle
-            return arrays["timesteps"] * repeat, np.asarray(arrays["results"], float)
-    monitor = folder / task / "0.monitor.csv"
-    rows = np.atleast_1d(np.genfromtxt(monitor, delimiter=",", skip_header=1, names=True))
-    points = max(len(rows) // WINDOW, 1)
-    parts = np.array_split(np.arange(len(rows)), points)
-    frames = rows["l"].cumsum()[[part[-1] for part in parts]] * repeat
+    evaluated = Evaluations.read(folder / task / EVALUATIONS)
+    if evaluated is not None:
+        return evaluated.steps * repeat, np.asarray(evaluated.returns, float)
+    played = TrainingEpisodes.read(folder / task / MONITOR)
+    points = max(len(played) // WINDOW, 1)
+    parts = np.array_split(np.arange(len(played)), points)
+    frames = played.lengths.cumsum()[[part[-1] for part in parts]] * repeat
     size = min(map(len, parts))
-    return frames, np.array([rows["r"][part][-size:] for part in parts])
+    return frames, np.array([played.returns[part][-size:] for part in parts])

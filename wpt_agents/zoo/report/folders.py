@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
+from wpt_agents.zoo.learning_curves import EVALUATIONS, Evaluations
 from wpt_agents.zoo.report.aggregates import Experiment
 from wpt_agents.zoo.result import FILE, Result, read_result
 from wpt_agents.zoo.sequence_result import read_sequence
@@ -49,14 +50,13 @@ class Finished:
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return frames (N,) and scores (N, episodes), successes where the task counts them."""
-        path = self.folder / "evaluations.npz"
-        if not path.exists():
+        stored = Evaluations.read(self.folder / EVALUATIONS)
+        if stored is None:
             return None
-        with np.load(path) as arrays:  # no pickle
-            success = self.result.metric == "success" and "successes" in arrays
-            scores = arrays["successes" if success else "results"]
-            repeat = self.result.frames / self.result.steps
-            return arrays["timesteps"] * repeat, np.asarray(scores, float)
+        counted = stored.successes if self.result.metric == "success" else None
+        scores = stored.returns if counted is None else counted
+        repeat = self.result.frames / self.result.steps
+        return stored.steps * repeat, np.asarray(scores, float)
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources)
     """
     check_plan(runs, engine, force)
     if engine == "none":
-        choose_threads(runs[0].preset.wpt.get("size", "paper"))
+        choose_threads(runs[0].preset.size)
         return run_all(runs, force)
     return run_on(engine, runs, force, resources)
 

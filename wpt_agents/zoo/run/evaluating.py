@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -12,6 +11,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.judge.evaluation import evaluate, film
 from wpt_agents.zoo.judge.untrained import BASELINES
+from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.pictures import runs as pictures
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import BEST, HEAD_START, LAST, PRIOR_ACTOR, Score
@@ -86,18 +86,13 @@ def draw(run: Run, agent: BaseAlgorithm, scores: Mapping[str, Score]) -> None:
 
 def _draw_curve(run: Run, title: str, scores: Mapping[str, Score]) -> None:
     repeat = run.preset.env.action_repeat
-    monitor = np.genfromtxt(run.folder / "0.monitor.csv", delimiter=",", skip_header=1, names=True)
-    training = np.atleast_1d(monitor)
-    path = run.folder / "evaluations.npz"
-    evaluated = None
-    if path.exists():
-        with np.load(path) as arrays:
-            evaluated = arrays["timesteps"] * repeat, arrays["results"]
+    training = TrainingEpisodes.read(run.folder / MONITOR)
+    evaluated = Evaluations.read(run.folder / EVALUATIONS)
     pictures.learning_curve(
         run.folder / "learning_curve.png",
         title,
-        training["l"].cumsum() * repeat,
-        training["r"],
+        training.lengths.cumsum() * repeat,
+        training.returns,
         scores,
-        evaluated,
+        (evaluated.steps * repeat, evaluated.returns) if evaluated else None,
     )

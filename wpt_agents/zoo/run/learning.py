@@ -17,6 +17,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.logs import ContinuedCSV
 from wpt_agents.zoo.judge.evaluation import episode_steps, make_vec_env
+from wpt_agents.zoo.learning_curves import MONITOR
 from wpt_agents.zoo.pictures import retrieval
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.run.checkpoints import (
@@ -49,7 +50,7 @@ class Effort:
 def make_training_env(run: Run) -> VecEnv:
     """Make the task to learn, in a process of its own where updates are made while it steps."""
     overlap = run.preset.learn.overlap and run.keywords.get("train_freq") == "step"
-    monitor = str(run.folder / "0.monitor.csv")
+    monitor = str(run.folder / MONITOR)
     venv = make_vec_env(run.task.id, run.shared.env, run.seed, monitor=monitor, workers=overlap)
     return run.algorithm.wrap(venv) if run.algorithm.wrap else venv
 

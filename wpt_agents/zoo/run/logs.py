@@ -8,6 +8,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from wpt_agents.zoo import learning_curves
 from wpt_agents.zoo.result import Metric
 
 
@@ -41,15 +42,13 @@ class Evaluations(EvalCallback):
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        path = Path(f"{self.log_path}.npz")
-        if path.exists():
-            with np.load(path) as arrays:
-                self.evaluations_timesteps = arrays["timesteps"].tolist()
-                self.evaluations_results = arrays["results"].tolist()
-                self.evaluations_length = arrays["ep_lengths"].tolist()
-                self.evaluations_successes = (
-                    arrays["successes"].tolist() if "successes" in arrays else []
-                )
+        before = learning_curves.Evaluations.read(Path(f"{self.log_path}.npz"))
+        if before is not None:
+            self.evaluations_timesteps = before.steps.tolist()
+            self.evaluations_results = before.returns.tolist()
+            self.evaluations_length = before.lengths.tolist()
+            if before.successes is not None:
+                self.evaluations_successes = before.successes.tolist()
             self.best_mean_reward = float(np.mean(self.evaluations_results, 1).max())
         self.n_calls = self.model.num_timesteps // self.model.n_envs
 

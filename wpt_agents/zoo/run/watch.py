@@ -11,6 +11,7 @@ import numpy as np
 from rich.live import Live
 from rich.table import Table
 
+from wpt_agents.zoo.learning_curves import MONITOR, TrainingEpisodes
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.tables import number
 from wpt_agents.zoo.tasks import short_name
@@ -38,9 +39,9 @@ class Standing:
 def standing(job: Run) -> Standing:
     """Reads a run's folder; nothing is written, and the run may be on another machine."""
     folder = job.folder
-    lengths, returns, times = read_monitor(folder / "0.monitor.csv")
-    steps = int(lengths.sum())
-    recent = float(returns[-RECENT:].mean()) if len(returns) else None
+    played = TrainingEpisodes.read(folder / MONITOR)
+    steps = int(played.lengths.sum())
+    recent = float(played.returns[-RECENT:].mean()) if len(played) else None
     if (folder / "result.json").exists():
         return Standing("finished", job.preset.steps, recent)
     if (folder / "error.txt").exists():
@@ -49,22 +50,10 @@ def standing(job: Run) -> Standing:
         return Standing("waiting")
     if not is_locked(folder):
         return Standing("stopped", steps, recent)
-    if not len(lengths):
+    if not len(played):
         return Standing("preparing")
     state = "evaluating" if steps >= job.preset.steps else "learning"
-    return Standing(state, steps, recent, speed(lengths, times))
-
-
-def read_monitor(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lengths, returns and times (seconds) of SB3's Monitor; a last line half written is left."""
-    rows = []
-    if path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)[2:]:
-            cells = line.split(",")
-            if line.endswith("\n") and len(cells) >= 3 and cells[0] != "r":
-                rows.append([float(cell) for cell in cells[:3]])
-    table = np.array(rows).reshape(-1, 3)
-    return table[:, 1], table[:, 0], table[:, 2]
+    return Standing(state, steps, recent, speed(played.lengths, played.times))
 
 
 def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:

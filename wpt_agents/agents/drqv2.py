@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
 from torch.optim import Adam
@@ -22,7 +21,6 @@ from wpt_agents.model.actor_critic import ema_update
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.frames import FrameEncoder, Trunk, mlp, orthogonal
 from wpt_agents.model.layers import frozen
-from wpt_agents.model.sizes import Size
 from wpt_agents.training.descent import descend
 from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.training.keywords import Stage, amount, count, schedule, share
@@ -151,29 +149,16 @@ class DrQv2Keywords(FrameKeywords):
 class DrQv2Policy(FramePolicy):
     """Encoder, actor, critic and target critic; the target critic has no encoder of its own.
 
-    :param channels: of each of the encoder's four layers
-    :param feature_dim: width of the trunks' latents
-    :param hidden_dim: width of the MLPs
+    Its widths are `channels`, `feature_dim` and `hidden_dim` of `DrQv2Keywords`.
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        clone_size: Size | None = None,
-        channels: int = 32,
-        feature_dim: int = 50,
-        hidden_dim: int = 1024,
-    ) -> None:
-        self.widths = channels, feature_dim, hidden_dim
-        super().__init__(observation_space, action_space, clone_size)
-
     def build(self) -> None:
-        """Draws the networks for actions of width `action_dim`."""
-        channels, features, hidden = self.widths
-        self.encoder = self.make_encoder(channels)
-        shape = self.encoder.embed_dim, features, hidden, self.action_dim
-        self.actor, self.critic = Actor(*shape), Critic(*shape)
+        """Draw the networks for actions of width `action_dim`."""
+        widths = self.widths
+        self.encoder = self.make_encoder(widths.channels)
+        shape = self.encoder.embed_dim, widths.feature_dim, widths.hidden_dim, self.action_dim
+        self.actor = Actor(*shape)
+        self.critic = Critic(*shape)
         for network in (self.actor, self.critic):
             network.apply(orthogonal)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
@@ -260,11 +245,6 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
     learner: DrQv2Learner
     hyperparameters: DrQv2Keywords
     shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "feature_dim", "hidden_dim")
-
-    def make_policy(self) -> DrQv2Policy:
-        """Make the networks, as wide as the environment's actions."""
-        widths = [getattr(self.hyperparameters, name) for name in self.shape_keywords]
-        return DrQv2Policy(self.observation_space, self.action_space, None, *widths)
 
     def make_learner(self) -> DrQv2Learner:
         """Make the optimisers."""

@@ -6,14 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.data.bars import shown
-from wpt_agents.data.convert import Data
 from wpt_agents.data.related import related_trajectories
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.transitions import Transitions, draw_transitions
@@ -90,28 +86,13 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     progress: FrameProgress
     retrieved: ReplayBuffer | None = None
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "CnnPolicy",
-        env: GymEnv | str | None = None,
-        *,
-        dataset: Data | None = None,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        device: torch.device | str = "auto",
-        _init_setup_model: bool = True,
-        **keywords: Any,
-    ) -> None:
-        super().__init__(
-            policy,
-            env,
-            dataset=dataset,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            _init_setup_model=_init_setup_model,
-            **keywords,
-        )
+    def make_policy(self) -> Any:
+        """Make the networks, as wide as the environment's actions."""
+        return self.policy_class(self.observation_space, self.action_space, **self.widths())
+
+    def widths(self) -> dict[str, Any]:
+        """Return the keywords of the policy's constructor, from those of the agent."""
+        return {name: getattr(self.hyperparameters, name) for name in self.shape_keywords}
 
     def unbound_action_space(self) -> spaces.Box:
         """Return the action space of an agent without an environment; `set_env` replaces it."""

@@ -6,11 +6,11 @@ version of the WPT paper: the clone drives the first h steps of an episode, h in
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Policy
+from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords
 from wpt_agents.model.prior_policy import PriorPolicy, prior_action
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training.cloning import Cloning, clone
@@ -74,12 +74,10 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
     hyperparameters: JSRLKeywords
     shape_keywords = (*DrQv2.shape_keywords, "bc_size")
 
-    def make_policy(self) -> DrQv2Policy:
-        """Make the networks, as wide as the environment's actions."""
-        settings = self.hyperparameters
-        widths = settings.channels, settings.feature_dim, settings.hidden_dim
-        size = SIZES[settings.bc_size]
-        return DrQv2Policy(self.observation_space, self.action_space, size, *widths)
+    def widths(self) -> dict[str, Any]:
+        """Return the keywords of the policy's constructor, from those of the agent."""
+        widths = super().widths()
+        return widths | {"clone_size": SIZES[widths.pop("bc_size")]}
 
     @property
     def wants_data(self) -> bool:

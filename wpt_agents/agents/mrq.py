@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 from torch.optim import AdamW
@@ -32,7 +31,6 @@ from wpt_agents.model.mrq import (
     value_loss,
     xavier_relu,
 )
-from wpt_agents.model.sizes import Size
 from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, amount, count
 from wpt_agents.training.model_files import optimizers
@@ -90,27 +88,14 @@ class MRQProgress(FrameProgress):
 class MRQPolicy(FramePolicy):
     """Encoder, actor, value functions, and a target of each.
 
-    :param channels: of each of the encoder's four layers
-    :param latent_dim: width of the features
-    :param hidden_dim: width of all hidden layers
+    Its widths are `channels`, `latent_dim` and `hidden_dim` of `MRQKeywords`.
     """
-
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        clone_size: Size | None = None,
-        channels: int = 32,
-        latent_dim: int = 512,
-        hidden_dim: int = 512,
-    ) -> None:
-        self.widths = channels, latent_dim, hidden_dim
-        super().__init__(observation_space, action_space, clone_size)
 
     def build(self) -> None:
         """Draw the networks for actions of width `action_dim`."""
-        _, width, hidden = self.widths
-        self.encoder = ModelEncoder(*self.widths, self.action_dim)
+        width = self.widths.latent_dim
+        hidden = self.widths.hidden_dim
+        self.encoder = ModelEncoder(self.widths.channels, width, hidden, self.action_dim)
         self.actor = NormedMLP(width, hidden, self.action_dim, "relu")
         self.value = ValuePair(width, hidden)
         for network in (self.encoder, self.actor, self.value):
@@ -225,10 +210,9 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
     progress: MRQProgress
     shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "latent_dim", "hidden_dim")
 
-    def make_policy(self) -> MRQPolicy:
-        """Make the networks, as wide as the environment's actions."""
-        widths = [getattr(self.hyperparameters, name) for name in self.shape_keywords]
-        policy = MRQPolicy(self.observation_space, self.action_space, None, *widths)
+    def make_policy(self) -> Any:
+        """Make the networks, and set the noise that the policy explores with."""
+        policy = super().make_policy()
         policy.std = self.hyperparameters.std
         return policy
 

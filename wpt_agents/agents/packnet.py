@@ -90,8 +90,8 @@ class PackNetPolicy(DrQv2Policy):
         for name, weight in self.managed():
             free = self.owner(name) == FREE
             weight[free] = fresh[name][free]
-        _, features, hidden = self.widths
-        shape = self.encoder.embed_dim, features, hidden, self.action_dim
+        widths = self.widths
+        shape = self.encoder.embed_dim, widths.feature_dim, widths.hidden_dim, self.action_dim
         # A critic belongs to one task's rewards; the paper re-initialises it, too.
         self.critic = Critic(*shape).apply(orthogonal).to(self.device)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
@@ -180,12 +180,6 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
     learner: PackNetLearner
     hyperparameters: PackNetKeywords
     progress: PackNetProgress
-
-    def make_policy(self) -> PackNetPolicy:
-        """Make the networks, as wide as the environment's actions."""
-        settings = self.hyperparameters
-        widths = settings.channels, settings.feature_dim, settings.hidden_dim
-        return PackNetPolicy(self.observation_space, self.action_space, None, *widths)
 
     def make_learner(self) -> PackNetLearner:
         """Make the optimisers, and mask the gradients of weights that earlier tasks own."""

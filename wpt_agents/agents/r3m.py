@@ -76,18 +76,14 @@ class FrameFeatures(nn.Module):
 class R3MPolicy(DrQv2Policy):
     """DrQ-v2's actor and critic on a frozen encoder, which new tasks keep.
 
-    :param backbone: of `FrameFeatures`
+    It has DrQ-v2's widths and `backbone`, of `FrameFeatures`.
     """
-
-    def __init__(self, *args: Any, backbone: str = "conv", **kwargs: Any) -> None:
-        self.backbone = backbone
-        super().__init__(*args, **kwargs)
 
     def make_encoder(self, channels: int) -> Any:
         """Keep the encoder, or draw it if there is none yet."""
         if hasattr(self, "encoder"):
             return self.encoder
-        return FrameFeatures(self.backbone, channels).requires_grad_(False)
+        return FrameFeatures(self.widths.backbone, channels).requires_grad_(False)
 
 
 class R3MLearner(DrQv2Learner):
@@ -155,13 +151,6 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
     shape_keywords = (*DrQv2.shape_keywords, "backbone")
     _features: list[np.ndarray]  # of each episode of `_features_of`
     _features_of: ReplayBuffer | None = None
-
-    def make_policy(self) -> R3MPolicy:
-        """Make the networks, as wide as the environment's actions."""
-        settings = self.hyperparameters
-        widths = settings.channels, settings.feature_dim, settings.hidden_dim
-        spaces = self.observation_space, self.action_space
-        return R3MPolicy(*spaces, None, *widths, backbone=settings.backbone)
 
     def make_learner(self) -> R3MLearner:
         """Make the optimisers."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
 from torch.optim import Adam
@@ -25,7 +24,6 @@ from wpt_agents.model.ensembles import CriticEnsemble, RewardEnsemble
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.model.frames import FrameEncoder, xavier
 from wpt_agents.model.layers import frozen
-from wpt_agents.model.sizes import Size
 from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
 from wpt_agents.training.descent import descend
 from wpt_agents.training.keywords import Stage, amount, choice, count, share
@@ -114,41 +112,26 @@ class RLPDKeywords(FrameKeywords):
 class RLPDPolicy(FramePolicy):
     """Encoder, actor, critics, their target networks with an encoder of their own, temperature.
 
-    :param channels: of the encoder's first layer; each further layer has twice as many
-    :param feature_dim: width of the trunks' latents
-    :param hidden_dim: width of the heads
-    :param critics: K, the number of critics
-    :param reward_members: the number of reward heads; 0 for none
+    Its widths are `channels`, `feature_dim`, `hidden_dim`, `critics` and `reward_members` of
+    `RLPDKeywords`; without the label 'optimistic' there are 0 of the latter.
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        clone_size: Size | None = None,
-        channels: int = 32,
-        feature_dim: int = 50,
-        hidden_dim: int = 256,
-        critics: int = 10,
-        reward_members: int = 0,
-    ) -> None:
-        self.widths = channels, feature_dim, hidden_dim
-        self.critics, self.reward_members = critics, reward_members
-        super().__init__(observation_space, action_space, clone_size)
-
     def build(self) -> None:
-        """Draws the networks for actions of width `action_dim`."""
-        channels, features, hidden = self.widths
-        self.encoder = FrameEncoder([channels * 2**i for i in range(4)], (2, 2, 2, 2))
-        shape = self.encoder.embed_dim, features, hidden, self.action_dim
-        self.actor, self.critic = TanhActor(*shape), CriticEnsemble(*shape, self.critics)
+        """Draw the networks for actions of width `action_dim`."""
+        widths = self.widths
+        self.encoder = FrameEncoder([widths.channels * 2**i for i in range(4)], (2, 2, 2, 2))
+        shape = self.encoder.embed_dim, widths.feature_dim, widths.hidden_dim, self.action_dim
+        self.actor = TanhActor(*shape)
+        self.critic = CriticEnsemble(*shape, widths.critics)
         for network in (self.encoder, self.actor, self.critic):
             network.apply(xavier)  # the ensemble's layers draw their own
         self.target_encoder = deepcopy(self.encoder).requires_grad_(False)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
-        self.log_alpha = nn.Parameter(torch.tensor(0.1).log())
-        if self.reward_members:
-            self.reward_ensemble = RewardEnsemble(features, hidden, self.reward_members)
+        self.log_alpha = nn.Parameter(torch.tensor(0.1).log())  # α = 0.1, as in the published code
+        if widths.reward_members:
+            self.reward_ensemble = RewardEnsemble(
+                widths.feature_dim, widths.hidden_dim, widths.reward_members
+            )
 
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
@@ -173,7 +156,7 @@ class RLPDLearner:
         self.critic_optimizer = Adam(value, learning_rate, fused=True)
         self.actor_optimizer = Adam(policy.actor.parameters(), learning_rate, fused=True)
         self.temperature_optimizer = Adam([policy.log_alpha], learning_rate, fused=True)
-        if policy.reward_members:
+        if policy.widths.reward_members:
             heads = policy.reward_ensemble.parameters()
             self.reward_optimizer = Adam(heads, learning_rate, fused=True)
 
@@ -189,7 +172,7 @@ class RLPDLearner:
         next_q, latent = self._look_ahead(batch.next_image, generator)
         reward = batch.reward
         metrics: dict[str, Tensor] = {}
-        if policy.reward_members:
+        if policy.widths.reward_members:
             ensemble = policy.reward_ensemble, self.reward_optimizer
             reward, metrics = label(
                 *ensemble, reward, latent, online, self.settings.beta, generator
@@ -210,7 +193,7 @@ class RLPDLearner:
         embed = policy.encoder(next_image)
         mean, log_std = policy.actor(embed)
         action, _ = tanh_sample(mean, log_std, generator)
-        member = torch.randint(policy.critics, (), generator=generator, device=embed.device)
+        member = torch.randint(policy.widths.critics, (), generator=generator, device=embed.device)
         next_q = policy.target_critic(policy.target_encoder(next_image), action)
         return next_q[member], policy.critic.trunk(embed)
 
@@ -256,18 +239,12 @@ class RLPD(FrameAgent, keywords=RLPDKeywords):
     hyperparameters: RLPDKeywords
     shape_keywords = "channels", "feature_dim", "hidden_dim", "critics", "label", "reward_members"
 
-    def make_policy(self) -> RLPDPolicy:
-        """Make the networks, as wide as the environment's actions."""
-        settings = self.hyperparameters
-        return RLPDPolicy(
-            self.observation_space,
-            self.action_space,
-            channels=settings.channels,
-            feature_dim=settings.feature_dim,
-            hidden_dim=settings.hidden_dim,
-            critics=settings.critics,
-            reward_members=settings.reward_members if settings.label == "optimistic" else 0,
-        )
+    def widths(self) -> dict[str, Any]:
+        """Return the keywords of the policy's constructor, from those of the agent."""
+        widths = super().widths()
+        if widths.pop("label") != "optimistic":
+            widths["reward_members"] = 0
+        return widths
 
     def make_learner(self) -> RLPDLearner:
         """Make the optimisers."""

@@ -1,5 +1,6 @@
 """How the model-free agents act: the networks see the last three images and keep no other state."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ class FramePolicy(PixelPolicy):
     :param observation_space: the environment's; images are converted at the border
     :param action_space: a Box
     :param clone_size: the widths of the prior actor, or None for no prior actor
+    :param widths: what `build` makes the networks of, by the names of the agent's keywords
     """
 
     action_mask: Tensor  # (A,) bool, all True: nothing is padded
@@ -32,9 +34,11 @@ class FramePolicy(PixelPolicy):
         observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         clone_size: Size | None = None,
+        **widths: Any,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.clone_size = clone_size
+        self.widths = SimpleNamespace(**widths)
         self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self.std = 1.0  # of the noise added to actions in collection, where there is any
         self.reset_behavior()
@@ -109,4 +113,5 @@ class FramePolicy(PixelPolicy):
         return state
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "clone_size": self.clone_size}
+        names = ["observation_space", "action_space", "clone_size"]
+        return {name: getattr(self, name) for name in names} | vars(self.widths)

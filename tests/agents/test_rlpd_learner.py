@@ -61,7 +61,7 @@ class Reference:
             {k: v.detach().clone() for k, v in w.items()} for w in (self.f, self.q)
         )
         self.adams = Adam(RATE, self.f, self.q), Adam(RATE, self.pi), Adam(RATE, self.alpha)
-        self.heads = parameters(policy.reward_ensemble) if policy.reward_members else None
+        self.heads = parameters(policy.reward_ensemble) if policy.widths.reward_members else None
         self.reward_adam = Adam(RATE, self.heads) if self.heads else None
 
     def act(self, h, generator):

@@ -199,12 +199,6 @@ class PixelAgent(SavedAgent):
             callback.on_rollout_end()
         return go_on
 
-    def time_limit(self) -> int | None:
-        """Return the steps after which the environment ends an episode, if it says so."""
-        assert self.env is not None
-        spec = self.env.get_attr("spec")[0] if self.env.has_attr("spec") else None
-        return getattr(spec, "max_episode_steps", None)
-
     def first_images(self, number: int) -> np.ndarray:
         """Return the first images of episodes, (number, 64, 64, 3).
 

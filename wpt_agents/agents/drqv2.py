@@ -26,7 +26,7 @@ from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.training.keywords import Stage, amount, count, schedule, share
 from wpt_agents.training.randomness import Purpose
 
-EDGE = 1 - 1e-6  # actions are clamped to this
+EDGE = 1 - 1e-6  # actions are clamped to this, as in the published code
 
 
 class Actor(nn.Module):

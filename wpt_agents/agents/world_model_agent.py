@@ -29,6 +29,7 @@ from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.prior_policy import PriorPolicy
 from wpt_agents.model.sizes import find_size
 from wpt_agents.training.checks import check_dataset, check_trajectory
+from wpt_agents.training.environments import time_limit
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.model_files import write_world_model
@@ -168,7 +169,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         known = self.hyperparameters.episode_length or self.progress.seen_length
         # 500 calls of `env.step` are an episode of DMControl at action repeat 2.
-        length = known or self.time_limit() or 500
+        length = known or time_limit(self.env) or 500
         return min(length, self.hyperparameters.max_trajectory_length)
 
     def on_episode(self, trajectory: Trajectory) -> None:

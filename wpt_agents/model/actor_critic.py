@@ -19,7 +19,7 @@ CONTEXT = 3  # images behind a state from which on more of them improve predicti
 def lambda_return(
     reward: Tensor,
     value: Tensor,
-    gamma: float = 0.99,
+    gamma: float = 0.99,  # Table 2, as are the other defaults of this module
     lam: float = 0.95,
     goes_on: Tensor | None = None,
 ) -> Tensor:
@@ -109,6 +109,7 @@ def actor_loss(
     """
     assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
     weight = actor_weight(gamma, entropy, goes_on)
+    # Eq. (4) prints v_t, but the text says that the λ-return is maximised: V_t.
     # Not in place: in the authors' code the entropy leaks into the critic's target by that.
     objective = lambda_return[:, 1:] / return_scale + ent_coef * entropy[:, :-1]
     return -(weight * objective).mean()
@@ -194,6 +195,7 @@ class Actor(Head):
     def truncated(outputs: Tensor, mask: Tensor) -> TruncatedNormal:
         """Return the distribution that the network's outputs (..., 2 A) parametrise."""
         mean, std = outputs.float().chunk(2, -1)
+        # These bounds are the authors', the paper does not print them.
         # The 2 makes exploration wide at first: a network that outputs 0 has a deviation of 0.89.
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
 

@@ -52,6 +52,8 @@ def draw_pairs(
 def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:
     """Shift each stack of frames by up to `pad` pixels, repeating the border.
 
+    The paper does not say how far; 3 pixels are the authors'. DrQ-v2 has 4 of 84.
+
     :param image: (N, F, H, W, C)
     """
     shape = len(image), 2

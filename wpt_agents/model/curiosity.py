@@ -16,7 +16,7 @@ class Scale(nn.Module):
     mean: Tensor
     weight: Tensor
 
-    def __init__(self, keep: float = 0.99) -> None:
+    def __init__(self, keep: float = 0.99) -> None:  # our choice: a mean over about 100 updates
         super().__init__()
         self.keep = keep
         self.register_buffer("mean", torch.zeros(()))
@@ -30,7 +30,7 @@ class Scale(nn.Module):
 
     def forward(self, surprise: Tensor) -> Tensor:
         """(...) -> (...)."""
-        return surprise * (self.weight / self.mean.clamp_min(1e-8))
+        return surprise * (self.weight / self.mean.clamp_min(1e-8))  # all surprises may be 0
 
 
 class ICM(nn.Module):
@@ -41,6 +41,7 @@ class ICM(nn.Module):
     :param forward_share: β of Pathak et al., the forward model's share of the loss
     """
 
+    # 0.2 is the β of the paper's experiments.
     def __init__(self, size: Size, action_dim: int, forward_share: float = 0.2) -> None:
         super().__init__()
         self.forward_share = forward_share

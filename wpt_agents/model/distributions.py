@@ -148,6 +148,8 @@ def kl_one_hot(left: Tensor, right: Tensor) -> Tensor:
 class TruncatedNormal:
     """Independent normal distributions truncated to [-1, 1], without the padded entries.
 
+    The authors clamp samples of a normal distribution instead, and do not mask padded samples.
+
     :param mean: (..., A), in [-1, 1]
     :param std: (..., A), positive
     :param mask: (..., A) bool, broadcast; where False a sample is 0 and nothing is counted

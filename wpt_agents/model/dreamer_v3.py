@@ -37,7 +37,7 @@ def reinforce_loss(
     advantage: Tensor,
     entropy: Tensor,
     weight: Tensor,
-    ent_coef: float = 3e-4,
+    ent_coef: float = 3e-4,  # DreamerV3's η, the same for all domains
     return_scale: Tensor | float = 1.0,
 ) -> Tensor:
     """DreamerV3's Eq. (11): -A_t / S ln π(a_t | s_t) - η H[a_t | s_t], step t weighing γ^t.

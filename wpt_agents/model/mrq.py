@@ -15,7 +15,7 @@ from wpt_agents.model.behavior_cloning import FRAMES
 from wpt_agents.model.distributions import symexp
 
 BINS = 65  # of the rewards, symexp-spaced over [-e^10, e^10]
-STRIDES = (2, 2, 2, 1)
+STRIDES = (2, 2, 2, 1)  # of 3x3 kernels: 64 > 31 > 15 > 7 > 5 pixels a side
 
 
 class NormedMLP(nn.Module):
@@ -193,7 +193,7 @@ def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
     :param q: (2, N)
     :param target: (N,); no gradient reaches it
     """
-    error = (q - target.detach()).abs()
+    error = (q - target.detach()).abs()  # α = 0.4 and the 1 are MR.Q's, of its replay
     beyond = (error.clamp_min(1) ** (1 + alpha) - 1) / (1 + alpha) + 0.5  # continuous at 1
     loss = torch.where(error < 1, 0.5 * error.square(), beyond)
     normaliser = error.detach().amax(0).clamp_min(1).pow(alpha).mean()

@@ -170,6 +170,7 @@ class WPTPolicy(PixelPolicy):
         deter, stoch, *_, before = (self._tensor(x) for x in state or fresh)
         first = check_episode_start(episode_start, n)
         inputs = self._tensor(image), Latent(deter, stoch), before, self._tensor(first)
+        # The authors draw the latent even if the action is deterministic.
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.acting_actor.truncated(outputs, self.action_mask)
         action = dist.mode if deterministic else dist.rsample(generator)
@@ -286,6 +287,7 @@ def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = N
     def act(state: Latent, _: int) -> Tensor:
         dist = policy.actor.dist(state.feat.detach(), policy.action_mask)
         entropies.append(dist.entropy())
+        # where tanh saturates, hardly any gradient reaches the actor; the log shows this share
         beyond = (dist.mean.detach().abs() > 0.99) & policy.action_mask
         saturated.append(beyond.float().sum(-1))
         return dist.rsample(generator)

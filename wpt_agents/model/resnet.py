@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 DEPTHS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3)}  # blocks of the four stages
 MEAN = 0.485, 0.456, 0.406  # of ImageNet's pixels, by colour
-STD = 0.229, 0.224, 0.225
+STD = 0.229, 0.224, 0.225  # and their standard deviations
 SIDE = 224  # pixels of the images that the published networks were trained on
 
 

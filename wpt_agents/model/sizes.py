@@ -50,7 +50,7 @@ class Size:
     actor_critic_learning_rate: float = 8e-5  # Table 2
     stabilised: bool = True  # not in the paper, but in every size below its own (docs/paper.md)
     blocks: int = 8  # as in DreamerV3
-    gates: str = "within"
+    gates: str = "within"  # as in DreamerV3; "across", a block decides over units of others
     norm_eps: float = NORM_EPS
     imagine_starts: int = 0
     pretrain_steps: int = 200_000  # Table 2, as all that follow

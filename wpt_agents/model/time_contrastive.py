@@ -80,7 +80,7 @@ def random_crop(clips: Tensor, rng: np.random.Generator) -> Tensor:
     :return: the same shape, float32 in 0 to 255
     """
     n = len(clips)
-    area = rng.uniform(0.2, 1.0, n)
+    area = rng.uniform(0.2, 1.0, n)  # these shares and ratios are those of the published code
     ratio = np.exp(rng.uniform(math.log(3 / 4), math.log(4 / 3), n))
     sides = np.minimum(np.sqrt(np.stack([area * ratio, area / ratio], 1)), 1.0)
     centre = rng.uniform(-1, 1, (n, 2)) * (1 - sides)

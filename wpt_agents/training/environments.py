@@ -222,6 +222,13 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
 # ----------------------------------------------------------------------- the end of an episode
 
 
+def time_limit(env: VecEnv | None) -> int | None:
+    """Return the steps after which the environment ends an episode, if it says so."""
+    assert env is not None
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    return getattr(spec, "max_episode_steps", None)
+
+
 def last_observation(
     env: VecEnv | None, infos: Sequence[Mapping[str, Any]], i: int, first: np.ndarray
 ) -> np.ndarray:

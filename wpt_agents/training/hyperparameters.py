@@ -61,6 +61,7 @@ class Hyperparameters(Keywords):
         "widths of all networks: debug, tiny, mid, small, medium, paper, or a `Size` or its fields",
         Stage.SIZE,
     )
+    # 12 is the widest robot of the 72 tasks, the quadruped; the authors pad to 21.
     max_action_dim: int = count(12, "A, the width that all actions are padded to", Stage.SIZE)
     unimix: float = share(
         0.01,

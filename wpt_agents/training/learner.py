@@ -256,5 +256,5 @@ class Learner(WorldModelLearner):
             return torch.ones_like(before), torch.ones_like(before)
         width = return_range(returns)
         unknown = before == 0  # these are the first returns
-        spread = torch.where(unknown, width, before.lerp(width, 0.01))
+        spread = torch.where(unknown, width, before.lerp(width, 0.01))  # DreamerV3's rate
         return spread, spread.clamp_min(1.0)

@@ -5,6 +5,8 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, Self
 
+from wpt_agents.training.environments import time_limit
+
 
 @dataclass(frozen=True)
 class Outlook:
@@ -56,7 +58,7 @@ class Outlook:
             replay=len(agent.replay_buffer) > 0,
             opened=0 if fresh else rollout.longest_open(),
             longest=agent.max_trajectory_length,
-            limit=agent.time_limit(),
+            limit=time_limit(agent.env),
             price=agent.steps_per_update() if agent.updates_per_step else math.inf,
             credit=agent.credit,
             learning_starts=agent.learning_starts,

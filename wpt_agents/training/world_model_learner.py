@@ -31,6 +31,8 @@ class WorldModelLearner:
         self.policy = policy
         self.hyperparameters = hyperparameters.resolved()
         model = policy.world_model
+        # One step for both, so weight decay counts once; in the authors' code it counts twice. The
+        # reward head sees detached states: rewards never train the world model.
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self.adam(parts, self.model_rate)
         self.add_continue_head()
@@ -146,6 +148,7 @@ class WorldModelLearner:
 
     def autocast(self) -> AbstractContextManager[None]:
         """Return the context of a forward pass, by the keyword `precision`."""
+        # The authors pre-train in float16; bfloat16 has float32's range and needs no loss scaling.
         bf16 = self.hyperparameters.precision == "bf16"
         kind = self.policy.device.type
         return torch.autocast(kind, torch.bfloat16, enabled=bf16, cache_enabled=True)

@@ -3,7 +3,7 @@
 #   make test       installs, then runs the tests
 #   make learn      the test that learns from scratch, three seeds of some minutes each
 # For contributors:
-#   make check      lint, types and the fast tests
+#   make check      lint, types and the fast tests, on all cores
 #   make format     formats the code and applies automatic fixes
 #   make lint       ruff, codespell and mypy
 #   make types      mypy alone
@@ -78,8 +78,9 @@ types: $(INSTALLED)
 format: $(INSTALLED)
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
+# A worker for each core; the processes that tests start must not take more than their worker's.
 check: lint rendering
-	@$(BIN)/python -m pytest -m "not slow and not nightly" $(TEST_ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not nightly" $(TEST_ARGS)
 
 nightly: rendering $(VENV)/.docs
 	@$(BIN)/python -m pytest -m nightly -v -rs $(TEST_ARGS)

@@ -15,6 +15,8 @@ from zoo_command import call
 
 from wpt_agents.agents.curious import Plan2Explore
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.model_file import read_model
+from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.report.folders import find_finished
 
 ARCHIVE = Path(__file__).parent / "fixtures" / "version-0.1.tar.xz"
@@ -36,6 +38,14 @@ def predicted(model):
         action, state = model.predict(image, state, deterministic=True)
         actions.append(action)
     return np.stack(actions)
+
+
+def test_the_page_about_migrating_names_every_keyword_that_is_new(earlier):
+    header, _ = read_model(earlier / "finished" / RUN / "model.zip")
+    page = (Path(__file__).parents[1] / "docs" / "migrating.md").read_text()
+    new = Hyperparameters.declared().keys() - header["hyperparameters"].keys()
+    assert {"fast", "ibrl"} <= new
+    assert not {name for name in new if f"`{name}`" not in page}
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from wpt_agents.training.keywords import (
     keyword,
     must,
     share,
+    with_default,
 )
 from wpt_agents.training.model_files import optimizers
 from wpt_agents.training.progress import Progress
@@ -46,15 +47,8 @@ class FrameKeywords(Keywords):
         Stage.RETRIEVAL,
     )
     num_retrieve: int | None = count(500, "offline trajectories to use at most", Stage.RETRIEVAL)
-    learning_starts: int = count(
-        2_000, "steps that are collected before the first update", Stage.ACTING, least=0
-    )
-    warmup_steps: int = count(
-        2_000,
-        "steps at the start that uniform random actions drive, to the end of the episode",
-        Stage.ACTING,
-        least=0,
-    )
+    learning_starts: int = with_default(Keywords, "learning_starts", 2_000)
+    warmup_steps: int = with_default(Keywords, "warmup_steps", 2_000)
     train_freq: str = choice(
         "step",
         ("episode", "step"),

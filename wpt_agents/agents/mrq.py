@@ -32,7 +32,7 @@ from wpt_agents.model.mrq import (
     xavier_relu,
 )
 from wpt_agents.training.descent import descend
-from wpt_agents.training.keywords import Stage, amount, count
+from wpt_agents.training.keywords import Stage, amount, count, with_default
 from wpt_agents.training.model_files import optimizers
 from wpt_agents.training.randomness import Purpose
 
@@ -62,15 +62,8 @@ class MRQKeywords(FrameKeywords):
     grad_clip: float = amount(20.0, "largest norm of the value functions' gradient")
     std: float = amount(0.2, "standard deviation of the noise on actions, also in targets")
     std_clip: float = amount(0.3, "largest noise in targets")
-    learning_starts: int = count(
-        10_000, "steps that are collected before the first update", Stage.ACTING, least=0
-    )
-    warmup_steps: int = count(
-        10_000,
-        "steps at the start that uniform random actions drive, to the end of the episode",
-        Stage.ACTING,
-        least=0,
-    )
+    learning_starts: int = with_default(FrameKeywords, "learning_starts", 10_000)
+    warmup_steps: int = with_default(FrameKeywords, "warmup_steps", 10_000)
 
 
 @dataclass(kw_only=True)

@@ -26,7 +26,7 @@ from wpt_agents.model.frames import FrameEncoder, xavier
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.tanh_actor import TanhActor, tanh_sample
 from wpt_agents.training.descent import descend
-from wpt_agents.training.keywords import Stage, amount, choice, count, share
+from wpt_agents.training.keywords import Stage, amount, choice, count, share, with_default
 from wpt_agents.training.randomness import Purpose
 
 LABELS = ("true", "zero", "optimistic")
@@ -95,18 +95,11 @@ class RLPDKeywords(FrameKeywords):
     )
     reward_members: int = count(5, "reward heads of the label 'optimistic'", Stage.SIZE)
     beta: float = amount(1.0, "weight of the deviation in the label 'optimistic'")
-    learning_rate: float = amount(3e-4, "learning rate of all networks")
+    learning_rate: float = with_default(FrameKeywords, "learning_rate", 3e-4)
     tau: float = share(0.005, "share by which the target networks move in an update")
     offline_ratio: float = share(0.5, "share of offline transitions in a batch; 0 for none")
-    learning_starts: int = count(
-        1_000, "steps that are collected before the first update", Stage.ACTING, least=0
-    )
-    warmup_steps: int = count(
-        1_000,
-        "steps at the start that uniform random actions drive, to the end of the episode",
-        Stage.ACTING,
-        least=0,
-    )
+    learning_starts: int = with_default(FrameKeywords, "learning_starts", 1_000)
+    warmup_steps: int = with_default(FrameKeywords, "warmup_steps", 1_000)
 
 
 class RLPDPolicy(FramePolicy):

@@ -39,7 +39,6 @@ class FramePolicy(PixelPolicy):
         super().__init__(observation_space, action_space, squash_output=True)
         self.clone_size = clone_size
         self.widths = SimpleNamespace(**widths)
-        self.generator: Generator | None = None  # of collection; `predict` leaves it alone
         self.std = 1.0  # of the noise added to actions in collection, where there is any
         self.reset_behavior()
 

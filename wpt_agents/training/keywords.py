@@ -161,7 +161,10 @@ class Keywords:
         1_000, "steps that are collected before the first update", Stage.ACTING, least=0
     )
     warmup_steps: int | None = count(
-        1_000, "steps at the start that uniform random actions drive", Stage.ACTING, least=0
+        1_000,
+        "steps at the start that uniform random actions drive, to the end of the episode",
+        Stage.ACTING,
+        least=0,
     )
     max_trajectory_length: int = count(
         1_000,
@@ -253,3 +256,9 @@ class Keywords:
     def as_dict(self) -> dict[str, Any]:
         """Return the values by name, as model files hold them."""
         return asdict(self)
+
+
+def with_default(keywords: type[Keywords], name: str, default: Any) -> Any:
+    """Declare a keyword of a base class again, with another default."""
+    declared = keywords.declared()[name]
+    return keyword(default, declared.check, declared.doc, declared.stage)

@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from wpt_agents.model.ensembles import RewardEnsemble
 from wpt_agents.training.descent import descend
 
-SHOWN = 0.8  # share of the online rows that each reward head learns from
+SHOWN = 0.8  # share of the online rows that each reward head learns from, so that they differ
 
 
 def reward_ensemble_loss(prediction: Tensor, reward: Tensor, shown: Tensor) -> Tensor:

@@ -95,7 +95,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         if not self.hyperparameters.continue_head or model.continue_head is not None:
             return
         if ends := sum(episode.terminated for episode in self.replay_buffer.trajectories):
-            odds = len(self.replay_buffer) / ends  # else half of all value were lost at first
+            odds = len(self.replay_buffer) / ends  # even odds would halve all values at first
             seed = self.streams.integer(Purpose.CONTINUE, 0)
             model.make_continue_head(math.log(odds), seed)
             self.learner.add_continue_head()

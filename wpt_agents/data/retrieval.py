@@ -178,7 +178,6 @@ class Retriever:
         return float(np.mean(same))
 
     def _candidates(self, embodiment: str | None, action_dim: int | None) -> np.ndarray:
-        # The authors compare action widths alone: robots of the same width are mixed up there.
         fits = np.ones(len(self), bool)
         if embodiment is not None:
             fits &= np.array([e is None or e == embodiment for e in self.embodiments], bool)

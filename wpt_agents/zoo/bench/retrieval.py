@@ -96,8 +96,8 @@ def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> 
         hits[row.suite].append(float(same[retriever.search(feature, k)[0]].mean()))
         chance[row.suite].append(float(same.mean()))
     columns: dict[str, Any] = {"queries": len(asked.task)}
-    for suite, own, by_chance in COLUMNS:
-        columns |= {own: _mean(hits[suite]), by_chance: _mean(chance[suite])}
+    for suite, share, share_by_chance in COLUMNS:
+        columns |= {share: _mean(hits[suite]), share_by_chance: _mean(chance[suite])}
     return columns
 
 

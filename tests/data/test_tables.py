@@ -352,6 +352,12 @@ def test_a_pickle_of_tdmpc2_is_loaded_by_those_who_trust_it_only(tmp_path):
     check(open_episodes(tmp_path / "chunk_0.pt", "tdmpc2", trust=True, **SMALL)[0], chain(5))
 
 
+def test_nonsense_is_not_called_a_pickle_where_pickles_are_trusted(tmp_path):
+    (tmp_path / "junk.pt").write_bytes(b"abc")
+    with pytest.raises(ValueError, match=r"junk\.pt cannot be read by torch\.load"):
+        open_episodes(tmp_path / "junk.pt", "tdmpc2", trust=True, **SMALL)
+
+
 def test_states_of_tdmpc2_are_refused_as_states(tmp_path):
     import torch
 

@@ -46,6 +46,8 @@ class TdMpc2Episodes(Episodes):
         try:
             content: Any = torch.load(file, map_location="cpu", weights_only=not self._trust)
         except pickle.UnpicklingError as error:
+            if self._trust:
+                raise ValueError(f"{file} cannot be read by torch.load: {error}") from error
             raise ValueError(
                 f"{file} is a pickle of more than tensors (.pt), and loading it runs whatever code "
                 "is in it; if you trust it, say so with trust=True (--trust)"

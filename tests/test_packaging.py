@@ -22,6 +22,7 @@ def test_the_version_is_the_same_everywhere():
     assert re.search(r'__version__ = "(.*)"', source)[1] == PROJECT["version"]
     assert re.search(r"^version: (.*)$", citation, re.M)[1] == PROJECT["version"]
     assert f"## [{PROJECT['version']}] - 20" in changelog
+    assert f"wpt_agents-{PROJECT['version']}-py3-none-any.whl" in (ROOT / "README.md").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,7 @@ def recordings(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_model_is_pretrained_from_a_folder_and_fine_tuned(
     example, recordings, tmp_path, monkeypatch, capsys
 ):
@@ -54,6 +55,7 @@ def test_an_environment_of_ones_own_is_learnt_in(example, capsys):
     assert "of at most 25" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_pretraining_is_compared_with_scratch(example, tmp_path):
     compare = example("compare_baseline").main
     scores = compare(2, 50, tmp_path / "data", pretrain_steps=2, **SMALL | {"size": "debug"})

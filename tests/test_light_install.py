@@ -94,6 +94,7 @@ def seconds(*words):
     return min(took)
 
 
+@pytest.mark.slow  # compares times
 def test_the_help_takes_little_longer_than_typer_itself():
     """As a ratio, since machines differ. Rich, which draws the help, is two thirds of the rest."""
     assert seconds("-m", "wpt_agents.zoo", "--help") < 5 * seconds("-c", "import typer")

@@ -53,6 +53,7 @@ def test_budgets_do_not_fall_as_sizes_grow():
             assert values == sorted(values), (name, values)
 
 
+@pytest.mark.slow
 def test_a_debug_model_of_the_defaults_clones_and_learns_within_a_thousand_steps(data):
     model = WPT.pretrain(data, steps=1, batch_size=2, batch_length=4, train_ratio=0.5, **LEAST)
     assert budgets(model) == {

@@ -327,6 +327,7 @@ def test_frame_t_plus_1_follows_from_action_t_and_from_no_other(trained):
         assert error(trained, replace(batch, action=batch.action.roll(shift, 1))) > 5 * right + 0.1
 
 
+@pytest.mark.slow
 def test_an_imagined_action_turns_the_imagined_image(trained):
     batch = windows(*(turn(6, 200 + seed) for seed in range(8)))
     with torch.no_grad():
@@ -341,6 +342,7 @@ def test_an_imagined_action_turns_the_imagined_image(trained):
                 assert torch.equal(seen[:, step], (place + int(action) * step) % 4)
 
 
+@pytest.mark.slow
 def test_a_reward_belongs_to_the_image_that_it_came_with(trained):
     batch = windows(*(turn(12, 300 + seed) for seed in range(8)))
     with torch.no_grad():

@@ -199,6 +199,7 @@ def test_another_task_begins_without_the_head():
 def test_an_explorer_saves_the_head_too(tmp_path):
     settings = {"size": "debug", "max_action_dim": 2, "batch_size": 2, "batch_length": 4}
     settings |= {"learning_starts": 7, "warmup_steps": 7, "offline_ratio": 0.0, "guidance": 0.0}
+    settings |= {"train_ratio": 4}
     env = ClockEnv(terminates=True)
     model = Plan2Explore("WPTPolicy", env, imagine_horizon=3, seed=0, device="cpu", **settings)
     list(model.explore(2))

@@ -14,6 +14,8 @@ from wpt_agents.training.outlook import Outlook
 
 SCRATCH = {"offline_ratio": 0.0, "guidance": 0.0, "warmup_steps": 0}
 ENDLESS = 10**9
+SHORT = {"max_trajectory_length": 150}  # so that the tests need not collect 1,000 steps
+COSTLY = {"train_ratio": 0.05, "learning_starts": 250}
 LEARNS = Outlook(
     start=0,
     stop=100,
@@ -65,15 +67,17 @@ def test_an_episode_of_unknown_length_may_end_soon_until_the_call_is_over():
 
 
 CASES = {
-    "learning_starts": (lambda: agent(ClockEnv(), **SCRATCH | {"learning_starts": 500}), 40),
-    "an endless episode": (lambda: agent(ClockEnv(ENDLESS), **SCRATCH), 100),
-    "train_ratio": (lambda: agent(ClockEnv(), **SCRATCH | {"train_ratio": 0.01}), 40),
+    "learning_starts": (lambda: agent(ClockEnv(), **SCRATCH | {"learning_starts": 100}), 40),
+    "an endless episode": (lambda: agent(ClockEnv(ENDLESS), **SCRATCH | SHORT), 100),
+    "train_ratio": (lambda: agent(ClockEnv(), **SCRATCH | {"train_ratio": 0.1}), 40),
     "all at once": (
-        lambda: agent(ClockEnv(ENDLESS), **SCRATCH | {"train_ratio": 0.01, "learning_starts": 500}),
+        lambda: agent(
+            ClockEnv(ENDLESS), **SCRATCH | SHORT | {"train_ratio": 0.05, "learning_starts": 250}
+        ),
         100,
     ),
     "two environments": (
-        lambda: agent(DummyVecEnv([lambda: ClockEnv(ENDLESS)] * 2), **SCRATCH),
+        lambda: agent(DummyVecEnv([lambda: ClockEnv(ENDLESS)] * 2), **SCRATCH | SHORT),
         100,
     ),
     "a time limit": (

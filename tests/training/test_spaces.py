@@ -66,7 +66,7 @@ def followed(env, words):
 
 
 def learnt(env, steps=21, **changes):
-    return agent(env, learning_starts=0, train_ratio=4, **changes).learn(steps)
+    return agent(env, learning_starts=0, train_ratio=1, **changes).learn(steps)
 
 
 def shown(model):

@@ -1,7 +1,8 @@
 """R3M (Nair et al., 2022): a frozen encoder that was pre-trained by time-contrastive learning.
 
 Source: https://arxiv.org/abs/2203.12601. Its language loss is left out, since our data have no
-words. DrQ-v2's actor and critic learn on the frozen features, as in https://arxiv.org/abs/2212.05749.
+words. DrQ-v2's actor and critic learn on the frozen features, as in
+https://arxiv.org/abs/2212.05749.
 """
 
 import os

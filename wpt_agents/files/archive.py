@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -104,11 +104,16 @@ def load_arrays(
             for name in archive.namelist():
                 if name.endswith(".npy"):
                     with archive.open(name) as member:
-                        arrays[name[:-4]] = np.lib.format.read_array(  # type: ignore[no-untyped-call]
-                            member, allow_pickle=False
-                        )
+                        arrays[name[:-4]] = _read_array(member)
     except (zipfile.BadZipFile, KeyError, EOFError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} is damaged or not a {kind} of version {VERSION} ({error}); make it again"
         ) from error
     return header, arrays
+
+
+def _read_array(file: IO[bytes]) -> np.ndarray:
+    array: np.ndarray = np.lib.format.read_array(  # type: ignore[no-untyped-call]
+        file, allow_pickle=False
+    )
+    return array

@@ -1,6 +1,10 @@
 """How the command line starts, helps and fails."""
 
+import re
+import shlex
+
 import pytest
+import typer
 from typer.main import get_command
 from zoo_command import call
 
@@ -28,6 +32,18 @@ def test_each_command_has_an_example_and_describes_every_option(name):
     assert f"Example: `python -m wpt_agents.zoo {name} " in command.help
     for option in command.params:
         assert option.name in ("help", "seed") or option.help, option.name
+
+
+@pytest.mark.parametrize("name", LEAVES)
+def test_the_examples_of_the_help_are_understood(name):
+    examples = re.findall(r"`python -m wpt_agents\.zoo (.*?)(?: > \S+)?`", LEAVES[name].help)
+    assert examples
+    for example in examples:
+        words, command = shlex.split(example), GROUP
+        while hasattr(command, "commands"):
+            _, command, words = command.resolve_command(typer.Context(command), words)
+        assert command is LEAVES[name]
+        command.make_context(name, words)  # raises on what it does not understand
 
 
 def fail(error):

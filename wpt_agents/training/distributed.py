@@ -122,9 +122,11 @@ def joined(device: torch.device) -> Iterator[World]:
     gpu = device if device.type == "cuda" else None
     if gpu:
         torch.cuda.set_device(gpu)  # objects, too, are sent by way of it
-    store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
+    # torch exports both names only where it was built with `distributed`, which mypy cannot know.
+    meet = dist.rendezvous  # type: ignore[attr-defined, unused-ignore]
+    store, rank, size = next(meet("env://", timeout=PATIENCE))
     backend = "nccl" if gpu else "gloo"
-    store = dist.PrefixStore(_meeting(), store)
+    store = dist.PrefixStore(_meeting(), store)  # type: ignore[attr-defined, unused-ignore]
     dist.init_process_group(
         backend, store=store, rank=rank, world_size=size, timeout=PATIENCE, device_id=gpu
     )

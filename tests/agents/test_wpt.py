@@ -551,11 +551,11 @@ def test_an_interrupted_update_costs_none_of_those_that_were_earned(monkeypatch)
         model.learn(4 * LENGTH, reset_num_timesteps=False)
         return model
 
-    undisturbed, model = learn(agent(DotEnv(), train_ratio=4)), agent(DotEnv(), train_ratio=4)
+    undisturbed, model = learn(agent(DotEnv(), train_ratio=1)), agent(DotEnv(), train_ratio=1)
     update = model.update
 
     def interrupted(metrics):
-        if model.updates == 5:
+        if model.updates == 1:
             monkeypatch.undo()
             raise KeyboardInterrupt
         update(metrics)

@@ -80,6 +80,7 @@ def test_another_device_learns_what_the_cpu_learns(other, tmp_path):
     assert back.policy.device.type == other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Plan2Explore, ICMExplorer])
 def test_another_device_explores_as_the_cpu_does(other, kind):
     here, there = (explorer(kind, device=device).learn(60) for device in ("cpu", other))

@@ -17,21 +17,27 @@ from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.report.paper_tables import Cell, TableRow, shared_note, without_notes
 
 
-@pytest.fixture
-def runs(tmp_path):
+def make_runs(folder):
     for seed in (0, 1):
-        make_run(tmp_path, "dmc-walker-run", seed, "wpt", (700.0, 760.0))
-        make_run(tmp_path, "dmc-walker-run", seed, "scratch", (90.0, 110.0))
-        make_run(tmp_path, "metaworld-reach", seed, "wpt", (9.0, 1.0 + 8 * seed))
-    failed = tmp_path / "debug" / "wpt" / "dmc-walker-walk_0"
+        make_run(folder, "dmc-walker-run", seed, "wpt", (700.0, 760.0))
+        make_run(folder, "dmc-walker-run", seed, "scratch", (90.0, 110.0))
+        make_run(folder, "metaworld-reach", seed, "wpt", (9.0, 1.0 + 8 * seed))
+    failed = folder / "debug" / "wpt" / "dmc-walker-walk_0"
     failed.mkdir()
     (failed / "config.yaml").write_text("task: x")
     (failed / "error.txt").write_text("Traceback\nRuntimeError: <out> of luck\n")
-    return tmp_path
+    return folder
 
 
 @pytest.fixture
-def page(runs):
+def runs(tmp_path):
+    return make_runs(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The text of a page about `runs`; one for all tests, which only read it."""
+    runs = make_runs(tmp_path_factory.mktemp("runs"))
     write_page(runs, runs / "report" / "index.html")
     return (runs / "report" / "index.html").read_text()
 

@@ -81,7 +81,9 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(array, other[name], err_msg=name)
 
 
-@pytest.mark.parametrize("method", ["wpt", "scratch", "drq-v2", "jsrl-bc", "explore", "r3m"])
+@pytest.mark.parametrize(
+    "method", ["wpt", "scratch", "drq-v2", "jsrl-bc", "uds", "explore", "r3m", "mrq", "dreamer-v3"]
+)
 def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeypatch, capsys):
     whole, broken = job(tmp_path / "whole", method, **CHANGES), job(tmp_path, method, **CHANGES)
     run(whole)

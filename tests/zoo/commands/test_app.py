@@ -76,6 +76,17 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_pa
     assert not (tmp_path / "runs").exists()
 
 
+def test_from_nothing_pre_trains_where_a_preset_starts_from_a_shipped_model(
+    monkeypatch, capsys, tmp_path
+):
+    words = ["--suite", "metaworld", "--tasks", "drawer-close", "--preset", "demo"]
+    words += ["--dry-run", "--out", tmp_path / "runs"]
+    assert call(monkeypatch, "run", *words) == 0
+    assert "world model  metaworld-mid, which ships" in capsys.readouterr().out
+    assert call(monkeypatch, "run", *words, "--from-nothing") == 0
+    assert "world model  2,500 updates to make" in capsys.readouterr().out
+
+
 def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
     assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2

@@ -36,6 +36,14 @@ SequenceName = Annotated[
     ),
 ]
 Force = Annotated[bool, typer.Option(help="Replace finished runs.")]
+FromNothing = Annotated[
+    bool,
+    typer.Option(
+        "--from-nothing",
+        help="Pre-train a world model even if the preset starts from one that ships "
+        "(`--set pretrain.model=`).",
+    ),
+]
 DryRun = Annotated[bool, typer.Option(help="Show the plan and do nothing.")]
 Watch = Annotated[
     bool, typer.Option(help="Only show the progress of these runs, made by another terminal.")
@@ -152,6 +160,7 @@ def run_benchmark(
     out: Out = Path("runs"),
     workers: Workers = 2,
     device: Device = "auto",
+    from_nothing: FromNothing = False,
     force: Force = False,
     dry_run: DryRun = False,
     watch: Watch = False,
@@ -183,6 +192,7 @@ def run_benchmark(
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
+    changes += ["pretrain.model="] if from_nothing else []
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence takes neither --tasks nor --watch, and no --engine")

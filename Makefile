@@ -1,5 +1,5 @@
 # Three commands on a bare machine (Python 3.12 or 3.11, git, a shell):
-#   make demo       installs, then runs the whole method on one task in minutes
+#   make demo       installs, then fine-tunes the shipped world model on one task in minutes
 #   make test       installs, then runs the tests
 #   make learn      the test that learns from scratch, three seeds of some minutes each
 # For contributors:
@@ -59,7 +59,7 @@ rendering: $(INSTALLED)
 	  2> $(VENV)/rendering.log || { echo "[rendering] $$(tail -n 1 $(VENV)/rendering.log)"; exit 1; }
 
 demo: rendering
-	@echo "[demo] collect, pre-train, index, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
+	@echo "[demo] collect, retrieve, clone, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
 	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo $(DEMO_ARGS)
 
 test: rendering

@@ -109,15 +109,6 @@ def test_the_readme_uses_public_names_only():
         assert module == "wpt_agents" and set(names) <= set(wpt_agents.__all__)
 
 
-def test_the_examples_keywords_are_those_of_the_demo():
-    demo = load_preset("metaworld", "demo")
-    assert demo.env.rendering in EXAMPLE and demo.collect.behaviour in EXAMPLE
-    calls = [node for node in ast.walk(ast.parse(EXAMPLE)) if isinstance(node, ast.Call)]
-    made = next(call for call in calls if getattr(call.func, "id", "") == "dict")
-    settings = {keyword.arg: ast.literal_eval(keyword.value) for keyword in made.keywords}
-    assert settings.items() <= demo.wpt.items() and len(settings) == 15
-
-
 def test_ones_own_data_are_stored_as_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image, action = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((3, 7), np.float32)

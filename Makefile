@@ -60,7 +60,7 @@ rendering: $(INSTALLED)
 
 demo: rendering
 	@echo "[demo] collect, retrieve, clone, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
-	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo --method wpt+ $(DEMO_ARGS)
+	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo $(DEMO_ARGS)
 
 test: rendering
 	@echo "[test] pytest -m 'not nightly' $(TEST_ARGS)"

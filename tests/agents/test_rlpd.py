@@ -104,6 +104,33 @@ def test_it_uses_trajectories_of_the_task_or_else_of_the_robot(dataset):
         agent(ClockEnv(), data, task="lift", embodiment="arm").learn(7)
 
 
+def test_data_that_are_set_later_take_the_place_of_those_that_were_chosen(dataset):
+    model = agent(ClockEnv(), dataset(reward=1.0)).learn(7)
+    model.set_dataset(dataset("other", reward=2.0, n=5))
+    model.learn(7)
+    assert len(model.retrieved.trajectories) == 5
+    assert {t.reward[0] for t in model.retrieved.trajectories} == {2.0}
+
+
+def test_images_of_another_size_are_refused_before_anything_is_collected(tmp_path):
+    one = recorded(embodiment="dot")
+    with TrajectoryDataset.create(tmp_path / "wide", image_size=128) as wide:
+        wide.append(replace(one, image=one.image.repeat(2, 1).repeat(2, 2)))
+    with pytest.raises(ValueError, match=r"images of 128 pixels, agents take 64.*image_size=64"):
+        agent(ClockEnv(), wide)
+
+
+def test_offline_actions_are_brought_into_the_units_of_the_environment(tmp_path):
+    one = recorded(length=30, embodiment="dot")
+    with TrajectoryDataset.create(tmp_path / "unit") as unit:
+        unit.append(replace(one, action=np.abs(one.action)))
+    model = agent(ClockEnv(low=0.0), unit, label="zero")
+    with pytest.warns(UserWarning, match="environment's own units"):
+        model.learn(7)
+    [read] = model.retrieved.trajectories
+    np.testing.assert_allclose(read.action, 2 * np.abs(one.action) - 1, atol=1e-6)
+
+
 def test_a_loaded_model_goes_on_exactly(dataset, tmp_path):
     data, settings = dataset(), {"label": "optimistic"}
     whole = agent(ClockEnv(), data, **settings).learn(42)

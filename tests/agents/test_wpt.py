@@ -745,6 +745,18 @@ def test_datasets_of_equal_shapes_are_told_apart_whatever_their_codec(tmp_path):
         assert len(prints) == 2
 
 
+def test_data_in_other_units_than_the_environment_are_reported_whichever_comes_first(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "arm") as arm:
+        arm.append(recorded(bounds=np.array([[-3.0, -3.0], [3.0, 3.0]])))
+    with pytest.warns(UserWarning, match="different units"):
+        agent(DotEnv(), dataset=arm)
+    later = agent(DotEnv())
+    with pytest.warns(UserWarning, match="different units"):
+        later.set_dataset(arm)
+    with pytest.warns(UserWarning, match="different units"):
+        agent(dataset=arm).set_env(DotEnv())
+
+
 @pytest.mark.slow
 def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path):
     model = pretrained(store, env=DotEnv()).learn(LENGTH)

@@ -10,10 +10,14 @@ from gymnasium import spaces
 
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.data.bars import shown
+from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.related import related_trajectories
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.transitions import Transitions, draw_transitions
+from wpt_agents.data.units import compare_units, in_units_of
 from wpt_agents.model.frame_policy import FramePolicy
+from wpt_agents.training.checks import check_images
 from wpt_agents.training.keywords import (
     Keywords,
     Stage,
@@ -111,6 +115,21 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         """Return the assignment by which `steps` collected steps pay for an update."""
         return f"model.update_every = {max(steps, 1)}"
 
+    def check_data(self, dataset: TrajectoryDataset) -> None:
+        """Refuse a dataset of no images, or of images of another size than the encoder's."""
+        check_images(dataset)
+
+    def check_units(self) -> None:
+        """Warn if the environment's actions are in other units than those of the dataset."""
+        if self.wants_data and self.dataset is not None and self.env is not None:
+            compare_units(self.dataset, self.action_space, self.hyperparameters.embodiment)
+
+    def set_dataset(self, dataset: Data | None) -> None:
+        """Use other offline data: whatever `open_dataset` takes. The next `learn` chooses them."""
+        super().set_dataset(dataset)
+        if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
+            self.retrieved = None
+
     def prepare(self, progress_bar: bool) -> None:
         """Choose and read the offline data, if any are used."""
         if not self.wants_data or self.retrieved is not None:
@@ -125,7 +144,8 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             self.progress.retrieved_of = self.dataset.fingerprint
         self.retrieved = ReplayBuffer()
         chosen = self.dataset.subset(self.progress.retrieved_ids)
-        for trajectory in shown(chosen, len(chosen), "retrieve", progress_bar):
+        read = in_units_of(chosen, self.action_space)
+        for trajectory in shown(read, len(chosen), "retrieve", progress_bar):
             if self.offline_rewards and trajectory.reward is None:
                 self.retrieved = None
                 raise ValueError(

@@ -134,9 +134,13 @@ class SavedAgent(KeywordAgent):
             opened = open_dataset(dataset)
             self.check_data(opened)
             self.dataset = opened
+            self.check_units()
 
     def check_data(self, dataset: TrajectoryDataset) -> None:
         """Refuse a dataset that the agent cannot learn from."""
+
+    def check_units(self) -> None:
+        """Warn if the environment's actions are in other units than those of the dataset."""
 
     def check_env(self, env: VecEnv) -> None:
         """Refuse an environment that the agent cannot act in."""
@@ -176,6 +180,7 @@ class SavedAgent(KeywordAgent):
         if force_reset:
             self._last_obs = None
         self.rollout = None
+        self.check_units()
         if self.hyperparameters.seed is not None:
             env.seed(self.hyperparameters.seed)
 
@@ -273,9 +278,8 @@ class SavedAgent(KeywordAgent):
         """
 
     def _check_same(self, header: Mapping[str, Any], names: tuple[str, ...]) -> None:
-        trained_with = self.keywords.of(
-            header["hyperparameters"]
-        )  # of a `Size` it fills new fields
+        # of a `Size` it fills new fields
+        trained_with = self.keywords.of(header["hyperparameters"])
         model_files.check_same(trained_with.as_dict(), self.hyperparameters.as_dict(), names)
 
     def set_parameters(

@@ -187,8 +187,11 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def check_env(self, env: VecEnv) -> None:
         """Refuse an environment that WPT cannot act in."""
         check_spaces(env, self.hyperparameters.max_action_dim)
-        if self.dataset is not None and isinstance(env.action_space, spaces.Box):
-            compare_units(self.dataset, env.action_space, self.hyperparameters.embodiment)
+
+    def check_units(self) -> None:
+        """Warn if the environment's actions are in other units than those of the dataset."""
+        if self.dataset is not None and self.env is not None:
+            compare_units(self.dataset, self.action_space, self.hyperparameters.embodiment)
 
     def on_other_actions(self) -> None:
         """Begin a new task if one was begun: its episodes and behaviour have another width."""

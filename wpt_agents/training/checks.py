@@ -1,4 +1,4 @@
-"""Refuse what WPT cannot learn from; every error names the culprit and the remedy."""
+"""Refuse what agents cannot learn from; every error names the culprit and the remedy."""
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ def check_images(dataset: TrajectoryDataset) -> None:
         raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
     if dataset.image_size != IMAGE_SIZE:
         raise ValueError(
-            f"The dataset {dataset.path} has images of {dataset.image_size} pixels, WPT takes "
+            f"The dataset {dataset.path} has images of {dataset.image_size} pixels, agents take "
             f"{IMAGE_SIZE}: make a resized copy, "
             f"TrajectoryDataset.merge('NEW', ['{dataset.path}'], image_size={IMAGE_SIZE})"
         )

@@ -2,8 +2,9 @@
 
     python examples/compare_baseline.py --seeds 3 --steps 1500
 
-The data are random actions in the environment of custom_environment.py, without rewards. For tasks
-of the library and for reports with intervals, `python -m wpt_agents.zoo run` does this and more.
+The data are episodes of random actions in the environment of custom_environment.py, without
+rewards. `python -m wpt_agents.zoo run` makes such comparisons for the tasks of the library, and
+reports them with intervals.
 """
 
 import argparse
@@ -34,7 +35,7 @@ def record(folder: Path, episodes: int) -> TrajectoryDataset:
 def main(
     seeds: int, steps: int, folder: Path, pretrain_steps: int = 1000, **changes: Any
 ) -> dict[str, list[float]]:
-    """Return the mean returns by method, one for each seed."""
+    """Pre-train once, learn with every seed, and return each method's mean return by seed."""
     settings = SETTINGS | changes
     dataset = record(folder, episodes=40)
     off = {"offline_ratio": 0, "guidance": 0}
@@ -56,8 +57,10 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="the number of seeds")
     parser.add_argument("--steps", type=int, default=1500, help="calls of env.step")
-    parser.add_argument("--folder", type=Path, default=Path("runs/comparison/data"))
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/comparison/data"), help="the recorded data"
+    )
     arguments = parser.parse_args()
     main(arguments.seeds, arguments.steps, arguments.folder)

@@ -45,7 +45,7 @@ class PushDot(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Put the dot somewhere."""
+        """Put the dot at a random position."""
         super().reset(seed=seed)
         self.dot = self.np_random.uniform(-0.9, 0.9, 2)
         self.target = np.array([0.5, 0.5])

@@ -2,8 +2,8 @@
 
     python examples/fine_tune.py runs/pretrained/model.zip data/arm --steps 10000
 
-The dataset is the one that the model was pre-trained on. Trajectories that start like the task are
-retrieved from it, replayed, and imitated by the prior actor that guides early episodes.
+The dataset is the one that the model was pre-trained on. `learn` retrieves trajectories from it
+that start like the task, and replays them. A clone of them, the prior actor, guides early episodes.
 """
 
 import argparse
@@ -45,11 +45,13 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("model", type=Path, help="a file of WPT.pretrain or WPT.save")
+    parser.add_argument("model", type=Path, help="a file that pretrain or save has written")
     parser.add_argument("dataset", type=Path, help="the folder that it was pre-trained on")
-    parser.add_argument("--task", default="wpt/metaworld-drawer-close-v0")
+    parser.add_argument("--task", default="wpt/metaworld-drawer-close-v0", help="an id of wpt_envs")
     parser.add_argument("--steps", type=int, default=10_000, help="calls of env.step")
-    parser.add_argument("--folder", type=Path, default=Path("runs/fine-tuned"))
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/fine-tuned"), help="for best_model.zip"
+    )
     arguments = parser.parse_args()
     environments = [gym.make(arguments.task, rendering="fast") for _ in range(2)]
     main(

@@ -3,8 +3,9 @@
     python examples/pretrain_from_folder.py recordings --steps 20000
 
 `recordings` contains one .npz file per episode, with `image` of (T + 1, 64, 64, 3) uint8 and
-`action` of (T + 1, A) in [-1, 1], whose first row is a placeholder. Other formats work as well: see
-docs/importing.md. Started again, the script continues from the last checkpoint.
+`action` of (T + 1, A) in [-1, 1]: row t led to image t, so the first row is a placeholder. Other
+formats work as well: see docs/importing.md. Started again, the script continues from the last
+checkpoint.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from wpt_agents import WPT
 
 
 def main(recordings: Path, steps: int, run_dir: Path, size: str, **changes: Any) -> WPT:
-    """Pre-train, print the loss now and then, and return the model."""
+    """Pre-train, print the loss every 500 steps, and return the model."""
 
     def report(step: int, metrics: dict[str, float]) -> None:
         if step % 500 == 0 or step == steps:
@@ -39,7 +40,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings", type=Path, help="a folder, file or dataset")
     parser.add_argument("--steps", type=int, default=20_000, help="updates")
-    parser.add_argument("--run-dir", type=Path, default=Path("runs/pretrained"))
-    parser.add_argument("--size", default="tiny", help="debug, tiny, small, medium or paper")
+    parser.add_argument(
+        "--run-dir", type=Path, default=Path("runs/pretrained"), help="for model.zip"
+    )
+    parser.add_argument("--size", default="tiny", help="debug, tiny, small, mid, medium or paper")
     arguments = parser.parse_args()
     main(arguments.recordings, arguments.steps, arguments.run_dir, arguments.size)

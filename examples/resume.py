@@ -40,6 +40,8 @@ def main(steps: int, folder: Path, block: int = 500, **changes: Any) -> WPT:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=3000, help="calls of env.step in total")
-    parser.add_argument("--folder", type=Path, default=Path("runs/resume"))
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/resume"), help="for the model and the replay"
+    )
     arguments = parser.parse_args()
     main(arguments.steps, arguments.folder)

@@ -15,7 +15,7 @@ from wpt_agents.zoo.commands.options import Spaced
 from wpt_agents.zoo.commands.report import report
 
 HELP = """\
-Collect data, pre-train world models, fine-tune them on tasks, compare the results.
+Collect data, pre-train world models, fine-tune them on tasks, and compare the results.
 
 Start with `python -m wpt_agents.zoo list`, then
 `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo`.
@@ -27,12 +27,12 @@ Three commands to start with:
       shows the tasks, the presets and the methods
 
   python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo
-      collects data, pre-trains a world model, fine-tunes it and films the result, in minutes
+      collects data, fine-tunes the shipped world model on a task and films the result, in minutes
 
   python -m wpt_agents.zoo report runs
       writes a page about all runs
 
-All commands: python -m wpt_agents.zoo --help. About one: python -m wpt_agents.zoo run --help.
+All commands: python -m wpt_agents.zoo --help. One command: python -m wpt_agents.zoo run --help.
 """
 PROGRAM = "python -m wpt_agents.zoo"
 DEBUG = "--debug"

@@ -32,19 +32,19 @@ Quick = Annotated[
 ]
 Threads = Annotated[
     int,
-    typer.Option(min=1, help="Threads of torch; several threads take turns with a single one."),
+    typer.Option(min=1, help="Threads of torch; the case model alternates them with one thread."),
 ]
 PrecisionOption = Annotated[Precision, typer.Option(help="The precision of the forward passes.")]
 Compiled = Annotated[
     bool,
     typer.Option(
         "--compile",
-        help="For model and gpu: compile scan and imagination by torch.compile, in minutes.",
+        help="For model and gpu: compile the recurrent steps with torch.compile, in minutes.",
     ),
 ]
 PeerOption = Annotated[
     Peer | None,
-    typer.Option(help="For model: measure this library's DreamerV3 beside ours instead."),
+    typer.Option(help="For model: compare with the DreamerV3 of this other library."),
 ]
 Plot = Annotated[
     Path | None, typer.Option(help="For scaling: draw the measurements into this file.")
@@ -58,14 +58,14 @@ Behaviour = Annotated[
 ]
 Steps = Annotated[
     int | None,
-    typer.Option(min=1, help="For exploration: the steps that explore-state learns from."),
+    typer.Option(min=1, help="For exploration: the number of steps that explore-state learns for."),
 ]
 Probe = Annotated[
     bool,
     typer.Option(
         "--probe",
-        help="In the case prediction, show instead how well linear probes read the true state "
-        "from the latents.",
+        help="For prediction: show instead how well linear probes read the true state from the "
+        "latents.",
     ),
 ]
 
@@ -84,11 +84,11 @@ def bench(
     steps: Steps = None,
     probe: Probe = False,
 ) -> None:
-    """Measure speed on this machine: medians after a warm-up.
+    """Measure speed, data formats, retrieval, prediction or exploration on this machine.
 
-    Times are processor time on one thread of a CPU, and wall-clock time otherwise.
+    Times are medians after a warm-up: CPU time with one thread, wall-clock time otherwise.
 
-    `share_of_ceiling` compares with a large matrix product in the same run; the work is counted.
+    `share_of_ceiling` is the speed relative to a large matrix product measured in the same run.
 
     Example: `python -m wpt_agents.zoo bench model --json > model.jsonl`
     """

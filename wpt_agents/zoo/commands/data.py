@@ -42,7 +42,7 @@ Out = Annotated[
 ]
 Episodes = Annotated[
     int | None,
-    typer.Option(min=1, help="Episodes of each task, as many as the paper's by default."),
+    typer.Option(min=1, help="Episodes per task; by default as many as in the paper."),
 ]
 Behaviour = Annotated[
     str,
@@ -53,12 +53,15 @@ Behaviour = Annotated[
 ]
 Sigma = Annotated[
     list[float],
-    typer.Option(help="Standard deviations of the noise on scripted and saved policies, in turn."),
+    typer.Option(
+        help="Standard deviations of the noise on scripted and saved policies; episodes use them "
+        "in turn."
+    ),
 ]
 Policy = Annotated[
     str | None,
     typer.Option(
-        help="The model for the behaviour policy: a file of WPT, or of SB3 as `sac:FILE`."
+        help="The model for `--behaviour policy`: a file of WPT, or of SB3 as `sac:FILE`."
     ),
 ]
 Rewards = Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")]
@@ -70,7 +73,10 @@ Settings = Annotated[
         help="Keywords of WPT for icm and plan2explore; steps=N for explore-state.",
     ),
 ]
-RenderingOption = Annotated[Rendering, typer.Option(help="The quality of the images.")]
+RenderingOption = Annotated[
+    Rendering, typer.Option(help="The quality of the images; fast has no shadows.")
+]
+Seed = Annotated[int, typer.Option(help="The seed of the episodes.")]
 
 
 def collect_data(
@@ -78,7 +84,7 @@ def collect_data(
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006  # typer wants a list
     episodes: Episodes = None,
-    seed: int = 0,
+    seed: Seed = 0,
     workers: Workers = 2,
     behaviour: Behaviour = "",
     sigma: Sigma = [0.1, 0.3, 0.5, 1.0, 2.0],  # noqa: B006
@@ -168,7 +174,7 @@ def merge_data(
         list[Path], typer.Argument(metavar="SRC...", help="The folders of the datasets to join.")
     ],
 ) -> None:
-    """Make a new dataset of all trajectories of other datasets, in their order.
+    """Join datasets: copy all their trajectories, in their order, into a new one.
 
     Example: `python -m wpt_agents.zoo data merge data/all data/noise data/curious`
     """

@@ -24,7 +24,7 @@ Source = Annotated[
 Out = Annotated[
     Path,
     typer.Argument(
-        metavar="DST", help="The dataset's folder; a conversion that was cut short goes on."
+        metavar="DST", help="The folder of the dataset; an interrupted conversion is continued."
     ),
 ]
 Embodiment = Annotated[str | None, typer.Option(help="The name of the robot, for all episodes.")]
@@ -36,32 +36,41 @@ ImageSize = Annotated[
 Crop = Annotated[
     bool, typer.Option("--crop", help="Cut out the middle square instead of squeezing images.")
 ]
-ImageKey = Annotated[str | None, typer.Option(help="Name of the images' array, or of the camera.")]
+ImageKey = Annotated[
+    str | None, typer.Option(help="The name of the array of images, or of the camera.")
+]
 ActionKey = Annotated[
     str | None,
-    typer.Option(help="Name of the actions' array, or several with commas between them."),
+    typer.Option(help="The name of the array of actions, or several names separated by commas."),
 ]
-DoneKey = Annotated[str | None, typer.Option(help="Name of the flags at which episodes end.")]
+DoneKey = Annotated[str | None, typer.Option(help="The name of the flags at which episodes end.")]
 Shifted = Annotated[
     bool | None,
     typer.Option(
         "--shifted/--no-shifted",
-        help="hdf5 and zarr: whether a row's action led to its observation (dm_env) or was "
-        "taken at it.",
+        help="For hdf5 and zarr: whether the action of a row led to its observation (dm_env) or "
+        "was taken at it.",
     ),
 ]
-Camera = Annotated[str | None, typer.Option(help="lerobot: name of the camera, as --image-key.")]
-Split = Annotated[str | None, typer.Option(help="rlds: read this split only, for example train.")]
+Camera = Annotated[
+    str | None, typer.Option(help="For lerobot: the name of the camera, as --image-key.")
+]
+Split = Annotated[
+    str | None, typer.Option(help="For rlds: read only this split, for example train.")
+]
 Low = Annotated[
     str | None,
-    typer.Option(help="Lowest values of the actions, if not -1: `--low=-2,-2`, or one."),
+    typer.Option(
+        help="The lowest value of each action, if not -1, or one value for all: `--low=-2,-2`."
+    ),
 ]
 High = Annotated[
-    str | None, typer.Option(help="Highest values of the actions, if not 1: `--high=2,2`.")
+    str | None,
+    typer.Option(help="The highest value of each action, if not 1, or one for all: `--high=2,2`."),
 ]
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="sb3 and tdmpc2: load a pickle, which may run any code."),
+    typer.Option("--trust", help="For sb3 and tdmpc2: load a pickle, which may run any code."),
 ]
 
 

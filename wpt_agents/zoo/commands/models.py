@@ -14,14 +14,14 @@ def import_model(
     out: Annotated[Path, typer.Argument(metavar="DST", help="The file to write, e.g. `m.zip`.")],
     export: Annotated[
         bool,
-        typer.Option("--export", help="Convert the other way: SRC is ours, DST in the format."),
+        typer.Option("--export", help="Convert the other way: SRC is a model file of WPT."),
     ] = False,
     stoch: Annotated[
         int | None,
         typer.Option(help="The number of groups of z, if it is not the authors' 32."),
     ] = None,
 ) -> None:
-    """Convert a model file in another format into one of ours, which every command takes.
+    """Convert a model file in another format into a model file of WPT, which every command takes.
 
     Example: `python -m wpt_agents.zoo import-model official dmcontrol.pt dmcontrol.zip`
 

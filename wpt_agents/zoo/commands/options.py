@@ -36,7 +36,7 @@ Suite = Annotated[
 Tasks = Annotated[
     list[str],
     typer.Option(
-        help="Names of tasks or patterns, e.g. `walker-run 'cheetah-*'`; the paper's by default."
+        help="Names of tasks or patterns, e.g. `walker-run 'cheetah-*'`; by default the paper's."
     ),
 ]
 Settings = Annotated[

@@ -15,28 +15,29 @@ def report(
         bool, typer.Option(help="Print a line for every policy, as CSV, instead.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="The folder of the page, `report` in FOLDER by default.")
+        Path | None, typer.Option(help="The folder of the page; by default `report` in FOLDER.")
     ] = None,
     record: Annotated[
         Path | None,
         typer.Option(
-            help="A CSV that keeps a line for every policy and run; lines of other runs stay."
+            help="A CSV file that gets a line for every policy and run; lines of other runs stay."
         ),
     ] = None,
     media: Annotated[
         str,
         typer.Option(
-            help="Which runs show videos and pictures: first (of each task), all or none."
+            help="The runs whose videos and pictures are in the page: first (of each task), all or "
+            "none."
         ),
     ] = "first",
 ) -> None:
     """Show the mean over seeds of every task and method, and write a page about all runs.
 
     The page is one file that needs no network: the paper's tables beside yours, aggregates with
-    intervals, learning curves, videos, the command behind each number, and what failed. The same
-    numbers are beside it as Markdown and CSV, for every policy: doing nothing, random, prior actor
-    and the agent. A record (--record results.csv) is small enough to outlive the run folders;
-    results.md and results.png beside it show it.
+    intervals, learning curves, videos, the command behind each number, and what failed. Markdown
+    and CSV files beside it have the numbers of every policy: doing nothing, random, prior actor and
+    the agent. A record (--record results.csv) is small enough to keep when the run folders are
+    deleted; results.md and results.png beside it show the same.
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """

@@ -17,11 +17,11 @@ def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
     model: Annotated[Path, typer.Option(help="The model file whose encoder compares the images.")],
     query: Annotated[
-        list[int], typer.Option(help="Numbers of trajectories of the dataset to search for.")
+        list[int], typer.Option(help="Numbers of trajectories whose first images to search for.")
     ] = [],  # noqa: B006
     task: Annotated[
         list[str],
-        typer.Option(help="Tasks whose first image to search for."),
+        typer.Option(help="Tasks whose first images to search for."),
     ] = [],  # noqa: B006
     suite: Suite = "dmc",
     rendering: Annotated[
@@ -38,7 +38,7 @@ def show_retrieval(
     ] = False,
     out: Picture = Path("retrieval.png"),
 ) -> None:
-    """Draw first images beside the trajectories with the most similar ones, with distances.
+    """Draw first images beside the trajectories that start most like them, with distances.
 
     Without --query and --task, the queries are some trajectories of the dataset.
 

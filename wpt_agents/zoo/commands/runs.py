@@ -11,18 +11,18 @@ PresetName = Annotated[
     str,
     typer.Option(help="How large the run is: debug, demo, tiny, mid, small, medium, paper, ..."),
 ]
-Out = Annotated[Path, typer.Option(help="The folder of the run folders and the shared stages.")]
+Out = Annotated[Path, typer.Option(help="The folder for run folders and for what runs share.")]
 Data = Annotated[
-    Path | None, typer.Option(help="Your own dataset, in place of the preset's collected data.")
+    Path | None, typer.Option(help="A dataset to use instead of collecting the preset's data.")
 ]
 Seeds = Annotated[
-    str, typer.Option(help="How many seeds (`3` is 0, 1 and 2), which (`0,5`), or a range (`0-2`).")
+    str, typer.Option(help="How many seeds (`3` is 0, 1, 2), which ones (`0,5`), or `0-2`.")
 ]
 MethodNames = Annotated[
     list[str],
     typer.Option(
-        help="One or more methods that `list` shows. Fig. 5 of the paper is `scratch "
-        "pretrain-only no-guidance wpt`."
+        help="One or more of the methods that `list` shows. The ablation of the paper's Fig. 5 is "
+        "`scratch pretrain-only no-guidance wpt`."
     ),
 ]
 Frames = Annotated[
@@ -44,32 +44,34 @@ FromNothing = Annotated[
         "(`--set pretrain.model=`).",
     ),
 ]
-DryRun = Annotated[bool, typer.Option(help="Show the plan and do nothing.")]
+DryRun = Annotated[bool, typer.Option(help="Only show what would be run.")]
 Watch = Annotated[
-    bool, typer.Option(help="Only show the progress of these runs, made by another terminal.")
+    bool, typer.Option(help="Only show the progress of these runs, started in another terminal.")
 ]
 Engine = Annotated[
     str,
     typer.Option(
-        help="Where runs are done. none: here, one after the other; local: each in its own "
+        help="Where runs execute. none: here, one after the other; local: each in its own "
         "process, `--workers` at a time; ray: on a cluster; slurm: as jobs of submitit."
     ),
 ]
 Cpus = Annotated[int, typer.Option(min=1, help="CPU cores to reserve for each run of an engine.")]
 Gpus = Annotated[
-    float, typer.Option(min=0, help="GPUs to reserve for each run of an engine; 0.5 with Ray.")
+    float,
+    typer.Option(min=0, help="GPUs to reserve for each run of an engine; with Ray also 0.5."),
 ]
 Memory = Annotated[
     float, typer.Option(min=0, help="GB of memory to reserve for each run on Ray and Slurm.")
 ]
 Hours = Annotated[
-    float, typer.Option(help="The time limit of a Slurm job; unfinished runs are sent again.")
+    float,
+    typer.Option(help="The time limit of a Slurm job; unfinished runs are submitted again."),
 ]
 Retries = Annotated[
-    int, typer.Option(min=0, help="How often a run is begun again when its worker dies.")
+    int, typer.Option(min=0, help="How often a run is continued after its worker was killed.")
 ]
 Address = Annotated[
-    str, typer.Option(help="The address of the Ray cluster; by default one is started here.")
+    str, typer.Option(help="The address of a Ray cluster; by default one is started here.")
 ]
 Partition = Annotated[
     str, typer.Option(help="The partition of Slurm; `local` works without Slurm.")
@@ -77,7 +79,7 @@ Partition = Annotated[
 
 
 def list_tasks(
-    suite: Annotated[str, typer.Option(help="The only suite to show.")] = "",
+    suite: Annotated[str, typer.Option(help="Show only this suite.")] = "",
 ) -> None:
     """Show the tasks of each suite, and the presets and methods that `run` knows.
 
@@ -118,7 +120,7 @@ def pretrain_model(
     workers: Workers = 2,
     device: Device = "auto",
     accumulate: Annotated[
-        int, typer.Option(min=1, help="Passes over each batch; more passes save memory.")
+        int, typer.Option(min=1, help="Parts that a batch is processed in; more save memory.")
     ] = 1,
 ) -> None:
     """Pre-train the world model of a preset, on its data or yours; `run` reuses it.
@@ -173,7 +175,7 @@ def run_benchmark(
     address: Address = "",
     partition: Partition = "",
 ) -> None:
-    """Do the whole method: collect, pre-train, index, fine-tune, evaluate.
+    """Run the whole method: collect, pre-train, index, fine-tune, evaluate.
 
     Each task, method and seed gets a run folder with its configuration, logs, model, learning
     curve, video and `result.json`. Finished stages are reused.
@@ -190,12 +192,12 @@ def run_benchmark(
     from wpt_agents.zoo.run.watch import watch as show_standings
 
     if started_by_torchrun():
-        raise ValueError("torchrun is for `pretrain`: start that by it, and then `run` without it")
+        raise ValueError("torchrun is for `pretrain`: pre-train with it, then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     changes += ["pretrain.model="] if from_nothing else []
     if sequence:
         if tasks or watch or engine != "none":
-            raise ValueError("--sequence takes neither --tasks nor --watch, and no --engine")
+            raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
         where = out, workers, device, data
         jobs = make_sequences(sequence, preset, seeds, method, changes, *where)
         if not do_sequences(jobs, force, dry_run):

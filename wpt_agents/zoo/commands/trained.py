@@ -10,7 +10,7 @@ from wpt_agents.zoo.commands.options import Device, print_table
 RunFolder = Annotated[
     Path,
     typer.Argument(
-        help="A run folder, which may have been moved or pulled, or a model file (.zip)."
+        help="A run folder, also one that was moved or downloaded, or a model file (.zip)."
     ),
 ]
 
@@ -18,16 +18,14 @@ RunFolder = Annotated[
 ForTask = Annotated[
     str,
     typer.Option(
-        help="The task, e.g. `dmc-walker-run`; needed for a model file without its run folder."
+        help="The task, e.g. `dmc-walker-run`; required for a file outside its run folder."
     ),
 ]
 
 
 Policy = Annotated[
     str,
-    typer.Option(
-        help="The policy to play: wpt, the trained agent, or prior, the clone that guided it."
-    ),
+    typer.Option(help="The policy to play: wpt for the trained agent, prior for its prior actor."),
 ]
 
 
@@ -73,7 +71,7 @@ def enjoy_model(
     """Film an episode of a trained model to an mp4, which any browser plays.
 
     With `--out policy.gif` it writes a GIF at half speed. Beside the episode are true images above
-    dreamed ones, which the world model predicts from the first five images and all actions.
+    those that the world model predicts from the first five images and all actions.
 
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -85,7 +83,7 @@ def enjoy_model(
     trained = find_trained(run, task)
     total = trained.record(out, policy, seed, size, device)
     megabytes = out.stat().st_size / 1e6
-    typer.echo(f"Return {number(total)}. Film: {out.resolve()} ({megabytes:.1f} MB)")
+    typer.echo(f"Return {number(total)}. Video: {out.resolve()} ({megabytes:.1f} MB)")
 
 
 def diagnose_model(
@@ -96,7 +94,7 @@ def diagnose_model(
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
     device: Device = "auto",
 ) -> None:
-    """Compare what a policy's world model predicts with what then happens.
+    """Compare the rewards and values that a model predicts with those that it then earns.
 
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -122,7 +120,7 @@ def judge_predictions(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Measure how well a world model predicts: its error by horizon, beside simple guesses.
+    """Measure how well a world model predicts: its error by horizon, beside simple baselines.
 
     Example: `python -m wpt_agents.zoo open-loop walker.zip data/unseen --out predictions`
     """
@@ -160,7 +158,7 @@ def pull_run(
         str, typer.Argument(help="The repository on the Hugging Face hub: `user/name`.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="The folder to write, the repository's name by default.")
+        Path | None, typer.Option(help="The folder to write; by default the repository's name.")
     ] = (None),
 ) -> None:
     """Download a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`.

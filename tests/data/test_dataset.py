@@ -591,7 +591,7 @@ def test_the_next_writer_removes_what_a_killed_one_left(tmp_path):
 def test_a_second_writer_is_refused_until_the_first_is_done(tmp_path):
     first, second = TrajectoryDataset.create(tmp_path, 8), TrajectoryDataset.open(tmp_path)
     first.append(chain(3))
-    with pytest.raises(ValueError, match="being written to by someone else"):
+    with pytest.raises(ValueError, match="being written to by another process"):
         second.append(chain(4))
     first.close()
     second.append(chain(4))

@@ -164,7 +164,7 @@ def append_in_turns(path, seed):
                     dataset.append(chain(20, seed, source=str(seed)))
                 break
             except ValueError as error:
-                assert "is being written to by someone else" in str(error)
+                assert "is being written to by another process" in str(error)
 
 
 def test_two_processes_that_append_at_once_lose_nothing(tmp_path):
@@ -177,7 +177,7 @@ def test_two_processes_that_append_at_once_lose_nothing(tmp_path):
 
 
 def be_refused(path):
-    with pytest.raises(ValueError, match="being written to by someone else; wait for it"):
+    with pytest.raises(ValueError, match="being written to by another process; wait for it"):
         TrajectoryDataset.open(path).append(chain(20))
 
 

@@ -1,4 +1,4 @@
-"""What is no dataset is refused by what it is, with a remedy."""
+"""What is not a dataset is refused by what it is, with a remedy."""
 
 import pickle
 import zipfile
@@ -90,15 +90,15 @@ def test_one_episode_in_npz_names_its_folder(tmp_path):
     ("data", "words"),
     [
         ([], "empty list"),
-        ({"image": 1, "action": 2}, r"A dictionary \(image, action\) is no dataset; make Traj"),
-        (np.zeros((3, 4)), r"array of \(3, 4\) is no dataset"),
-        (torch.zeros(3, 4), r"array of \(3, 4\) is no dataset"),
-        ((np.zeros(3), np.zeros(2)), "A tuple of arrays is no dataset"),
-        ([np.zeros(3), np.zeros(2)], "A list of arrays is no dataset"),
-        (b"path", "type bytes is no dataset"),
-        (3, "type int is no dataset; give a TrajectoryDataset, a path"),
+        ({"image": 1, "action": 2}, r"A dictionary \(image, action\) is not a dataset; make Traj"),
+        (np.zeros((3, 4)), r"array of \(3, 4\) is not a dataset"),
+        (torch.zeros(3, 4), r"array of \(3, 4\) is not a dataset"),
+        ((np.zeros(3), np.zeros(2)), "A tuple of arrays is not a dataset"),
+        ([np.zeros(3), np.zeros(2)], "A list of arrays is not a dataset"),
+        (b"path", "type bytes is not a dataset"),
+        (3, "type int is not a dataset; give a TrajectoryDataset, a path"),
         (iter([chain(3, size=64), 5]), "Item 1 of the list_iterator is a int"),
-        (gym.Env(), r"An environment \(Env\) is no dataset: give it as env="),
+        (gym.Env(), r"An environment \(Env\) is not a dataset: give it as env="),
     ],
 )
 def test_objects_of_other_kinds_are_called_by_name(data, words):

@@ -182,10 +182,10 @@ class Explorer(WPT):
             yield self.replay_buffer.trajectories[-1]
         if self.num_timesteps and self.updates_per_step and not self.updates:
             warnings.warn(
-                f"explore({episodes}) made no update, so that nothing steered it: none is made in "
-                f"the first learning_starts={self.learning_starts} steps, and it has collected "
-                f"{self.num_timesteps}. Explore more episodes, or set model.learning_starts = 0 "
-                "and model.warmup_steps = 0 before it",
+                f"explore({episodes}) made no update and so learned nothing: there is none in the "
+                f"first learning_starts={self.learning_starts} steps, and it has "
+                f"collected {self.num_timesteps}. Explore more episodes, or set "
+                "model.learning_starts = 0 and model.warmup_steps = 0 before the call",
                 stacklevel=2,
             )
 

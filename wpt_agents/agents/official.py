@@ -88,9 +88,9 @@ def export_model(policy: WPTPolicy, path: Path) -> None:
     size = policy.size
     if (size.gates, size.norm_eps) != (GATES, NORM_EPS):
         raise ValueError(
-            f"The authors' code computes another function of these weights: it needs a model of "
-            f"gates={GATES!r} and norm_eps={NORM_EPS}, this one has gates={size.gates!r} and "
-            f"norm_eps={size.norm_eps}"
+            f"The authors' code computes another function of these weights: it needs a model whose "
+            f"size has gates={GATES!r} and norm_eps={NORM_EPS}, this one has "
+            f"gates={size.gates!r} and norm_eps={size.norm_eps}"
         )
     weights = policy.state_dict()
     write_official(path, {name.replace("_orig_mod.", ""): w for name, w in weights.items()})

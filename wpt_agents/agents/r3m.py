@@ -166,7 +166,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         if not isinstance(body, ResNet) or body.state_dict().keys() != weights.keys():
             raise ValueError(
                 f"{os.fspath(path)} does not fit backbone={self.hyperparameters.backbone!r}: make "
-                "the agent with backbone='resnet18', 'resnet34' or 'resnet50', as the file's name"
+                "the agent with the backbone of the file, 'resnet18', 'resnet34' or 'resnet50'"
             )
         body.load_state_dict(weights)
         self._features_of = None
@@ -212,7 +212,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         :param kwargs: keywords of `R3M`
         """
         if accumulate != 1:
-            raise ValueError(f"R3M makes each update in one pass, got accumulate={accumulate}")
+            raise ValueError(
+                f"R3M makes each update in one pass, got accumulate={accumulate}: leave it out"
+            )
         cls.check_keywords(kwargs)
         model = cls(seed=seed, **kwargs)
         model.set_dataset(dataset)

@@ -38,9 +38,9 @@ from wpt_agents.training.retrieving import read_retrieved, retrieve_ids, with_ke
 from wpt_agents.training.rollout import Window
 
 NO_DATASET = (
-    "No dataset: nothing is rehearsed, no prior actor guides or is imitated, and model.prior stays "
-    "None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, kickstart=0 if this "
-    "is intended"
+    "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
+    "model.prior stays None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, "
+    "kickstart=0 if this is intended"
 )
 
 
@@ -162,7 +162,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         progress = self.progress
         used = settings.needs_clone or settings.offline_ratio
         if self.dataset is None and progress.retrieved_ids and settings.offline_ratio:
-            warnings.warn("Rehearsal ends: give dataset= to load, or offline_ratio=0", stacklevel=3)
+            what = "Without its dataset the model rehearses no more: load it with dataset="
+            warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=3)
         elif self.dataset is None and used and not progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=3)
         if self.dataset is None or self.retrieved is not None or not used:

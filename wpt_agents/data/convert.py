@@ -93,22 +93,23 @@ def refuse_object(data: Any) -> None:
     kind = type(data).__name__
     make = "make Trajectory(image, action) of each episode and give their list"
     if isinstance(data, Mapping):
-        raise ValueError(f"A dictionary ({', '.join(map(str, data))}) is no dataset; {make}")
+        raise ValueError(f"A dictionary ({', '.join(map(str, data))}) is not a dataset; {make}")
     if isinstance(data, np.ndarray | torch.Tensor):
         raise ValueError(
-            f"An array of {tuple(data.shape)} is no dataset: it has images or actions alone; {make}"
+            f"An array of {tuple(data.shape)} is not a dataset: it has images or actions only; "
+            f"{make}"
         )
     if isinstance(data, Sequence) and any(
         isinstance(item, np.ndarray | torch.Tensor) for item in data
     ):
-        raise ValueError(f"A {kind} of arrays is no dataset; {make}")
+        raise ValueError(f"A {kind} of arrays is not a dataset; {make}")
     if isinstance(data, gym.Env | VecEnv):
         raise ValueError(
-            f"An environment ({kind}) is no dataset: give it as env=, and as dataset= the data"
+            f"An environment ({kind}) is not a dataset: give it as env=, and as dataset= the data"
         )
     if isinstance(data, bytes) or not isinstance(data, Iterable):
         raise ValueError(
-            f"An object of type {kind} is no dataset; give a TrajectoryDataset, a path, "
+            f"An object of type {kind} is not a dataset; give a TrajectoryDataset, a path, "
             "trajectories, a replay buffer, or a list of these"
         )
 

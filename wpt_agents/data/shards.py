@@ -123,7 +123,9 @@ class Writer:
             self._shard = self._open_shard(self._number, self._end)
         except BlockingIOError as error:
             self._index.close()
-            raise ValueError(f"{path} is being written to by someone else; wait for it") from error
+            raise ValueError(
+                f"{path} is being written to by another process; wait for it"
+            ) from error
         except BaseException:
             self._index.close()
             raise

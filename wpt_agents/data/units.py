@@ -85,10 +85,10 @@ class Ranges:
                 continue
             which = ", ".join(f"{i} ({least[i]:.3g} to {most[i]:.3g})" for i in np.flatnonzero(odd))
             warnings.warn(
-                f"{name}: the actions were taken as they are, but of {width} dimensions these "
-                f"never leave [0, 1] or fill a small part of [-1, 1]: {which}. If they are in the "
+                f"{name}: the actions were not rescaled, but of {width} dimensions these never "
+                f"leave [0, 1] or fill a small part of [-1, 1]: {which}. If they are in the "
                 "environment's own units, import them with the limits of its action space, "
-                "low=[...] and high=[...] (--low, --high); low=-1 and high=1 say that they are "
+                "low=[...] and high=[...] (--low, --high); low=-1 and high=1 confirm that they are "
                 "right",
                 stacklevel=3,
             )
@@ -137,7 +137,7 @@ def in_units_of(trajectories: Iterable[Trajectory], box: spaces.Box) -> Iterator
         warnings.warn(
             "The data's actions are taken to be in the environment's own units, and rescaled, in "
             f"these dimensions, where they are never negative: {which}. Import the data with low "
-            "and high to decide it (low=-1 and high=1 if they are in [-1, 1] already)",
+            "and high to decide this (low=-1 and high=1 if they are in [-1, 1] already)",
             stacklevel=3,
         )
     for trajectory in trajectories:

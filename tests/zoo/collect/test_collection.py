@@ -208,7 +208,7 @@ def test_a_folder_with_other_settings_is_refused(tmp_path):
 def test_a_dataset_that_collect_did_not_make_is_left_alone(tmp_path):
     collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
     (tmp_path / "data" / "collect.json").unlink()
-    with pytest.raises(ValueError, match="holds something else"):
+    with pytest.raises(ValueError, match="contains another collection"):
         collect(tmp_path / "data", [DOT], 2, workers=1, progress_bar=False)
 
 
@@ -226,7 +226,7 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"episodes": 0}, "at least 1 episode"),
         ({"behaviour": "noize"}, "Did you mean 'noise'"),
         ({"behaviour": "policy"}, "wants policy=FILE"),
-        ({"policy": "a.zip"}, "and no other"),
+        ({"policy": "a.zip"}, "is for the behaviour 'policy'"),
         ({"behaviour": "policy", "policy": "no.zip"}, r"No policy no\.zip"),
         ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),

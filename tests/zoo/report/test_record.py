@@ -115,7 +115,7 @@ def test_presets_are_kept_apart():
 
 def test_another_csv_is_refused(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ValueError, match=r"other.csv is no record.*its columns are suite"):
+    with pytest.raises(ValueError, match=r"other.csv is not a record.*its columns are suite"):
         record.read(tmp_path / "other.csv")
 
 

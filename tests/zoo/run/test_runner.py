@@ -251,7 +251,7 @@ def test_a_folder_that_is_no_run_is_never_deleted(tmp_path):
     one = job(tmp_path)
     one.folder.mkdir(parents=True)
     (one.folder / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="no run folder"):
+    with pytest.raises(ValueError, match="not a run folder"):
         run(one, force=True)
     assert (one.folder / "thesis.txt").exists()
 

@@ -144,8 +144,8 @@ def warn_left_out(count: int, source: object) -> None:
     """Say how many episodes of a single image a reader leaves out."""
     if count:
         warnings.warn(
-            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, for want of "
-            "an action that led anywhere",
+            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, as no image "
+            "shows the outcome of an action",
             stacklevel=3,
         )
 

@@ -132,12 +132,12 @@ class NpzEpisodes(Episodes):
             if arrays[name].shape[:1] != arrays[key].shape[:1]:
                 raise ValueError(
                     f"{file} has {arrays[name].shape[0]} actions for {len(arrays[key])} images; in "
-                    "this format they are equally many, the first action a placeholder"
+                    "this format they are equally many, and the first action is a placeholder"
                 )
         if arrays.get("is_first", np.zeros(1))[1:].any():
             raise ValueError(
                 f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
-                "write a file an episode"
+                "write one file per episode"
             )
         return key
 
@@ -178,7 +178,7 @@ class Member:
         self.shape, fortran, self.dtype = read(self._stream)
         # objects would need a pickle; rows of Fortran order are not adjacent
         if self.dtype.hasobject or fortran:
-            raise ValueError(f"{name} is no plain array in C order")
+            raise ValueError(f"{name} is not a plain array in C order")
         self._data = self._stream.tell()
 
     def __len__(self) -> int:

@@ -142,7 +142,7 @@ def _file(path: Path, formats: str) -> str:
             "may be an HDF5 file, but is not recognised by its suffix; if it holds episodes, name "
             f"the format: `{IMPORT} hdf5 {path} DST`"
         )
-    return f"is no format that can be imported ({formats}); {MAKE}"
+    return f"is in no format that can be imported ({formats}); {MAKE}"
 
 
 def _folder(path: Path, formats: str) -> str:

@@ -105,7 +105,7 @@ class RldsEpisodes(Episodes):
                 )
         arrays = [np.asarray(self._find(steps, name, source)) for name in names]
         if any(array.dtype.kind not in "fiu" for array in arrays):
-            raise ValueError(f"{source} has actions that are no numbers: {', '.join(names)}")
+            raise ValueError(f"{source} has actions that are not numbers: {', '.join(names)}")
         columns = [array.astype(np.float32).reshape(count, -1) for array in arrays]
         return np.concatenate(columns, axis=1)
 

@@ -195,7 +195,7 @@ def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
 def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | None) -> None:
     if not tasks or len(set(tasks)) < len(tasks) or episodes < 1:
         raise ValueError(
-            f"collect wants different tasks and at least 1 episode of each, got {list(tasks)} "
+            f"collect needs different tasks and at least 1 episode of each, got {list(tasks)} "
             f"and {episodes}"
         )
     if behaviour not in BEHAVIOURS:
@@ -203,7 +203,9 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
     if behaviour == "scripted" and not any(map(has_script, tasks)):
         raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
     if (behaviour == "policy") != (policy is not None):
-        raise ValueError("The behaviour 'policy', and no other, wants policy=FILE (--policy FILE).")
+        raise ValueError(
+            "policy=FILE (--policy FILE) is for the behaviour 'policy', which needs it."
+        )
     if policy is not None:
         load_policy(policy)  # says what is wrong with it
 
@@ -230,8 +232,8 @@ def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     differ = [key for key in {**description, **stored} if stored.get(key) != description.get(key)]
     if differ:
         raise ValueError(
-            f"{path} holds something else than this collection (different: {', '.join(differ)}); "
-            "give another path, or delete it"
+            f"{path} contains another collection (different: {', '.join(differ)}); choose another "
+            "path, or delete it"
         )
     return dataset
 

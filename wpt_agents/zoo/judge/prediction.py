@@ -51,7 +51,7 @@ def judge(
     if not long.any():
         raise ValueError(
             f"The longest trajectory of {dataset.path} has {max(dataset.lengths) + 1} images, but "
-            f"{CONTEXT} filtered and {HORIZON} predicted ones are asked for: take longer episodes"
+            f"{CONTEXT} observed and {HORIZON} predicted ones are needed: use longer episodes"
         )
     for robot in dict.fromkeys(names[long].tolist()):
         candidates = np.flatnonzero(long & (names == robot))

@@ -77,7 +77,7 @@ class Trained:
         :raises ValueError: an unknown policy, a model without a prior actor, another ending
         """
         if path.suffix not in FILMS:
-            raise ValueError(f"{path}: the name of a film ends in {' or '.join(FILMS)}")
+            raise ValueError(f"{path}: the name of a video must end in {' or '.join(FILMS)}")
         agent = self.load_agent(device)
         trajectory, shots, fps = film(
             self.choose(agent, policy), self.task, self.env, seed, size, wrap=self.method.wrap
@@ -141,4 +141,4 @@ def read_origin(folder: Path) -> Origin | None:
         env = EnvSettings.of("env", config.env)
         return Origin(config.task, asdict(env), getattr(config, "method", "wpt"))
     except (yaml.YAMLError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path} is no run's configuration ({error!r})") from None
+        raise ValueError(f"{path} is not the configuration of a run ({error!r})") from None

@@ -285,7 +285,7 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
     """Reads 'learn.frames=1000' as {'learn': {'frames': 1000}}; without a dot it is WPT's."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise ValueError(f"--set wants key=value, got {text!r}.")
+        raise ValueError(f"--set takes key=value, got {text!r}.")
     title, dot, key = key.strip().rpartition(".")
     if not dot and key not in {*wpt_keywords(), *EXPLORATION_KEYWORDS}:
         types = get_type_hints(Preset)
@@ -297,4 +297,4 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
     try:
         return {title or "wpt": {key: read_yaml(value) if value.strip() else ""}}
     except yaml.YAMLError:
-        raise ValueError(f"--set {key}: {value!r} is no valid YAML value.") from None
+        raise ValueError(f"--set {key}: {value!r} is not a valid YAML value.") from None

@@ -140,7 +140,7 @@ def read(path: Path) -> list[Line]:
         return [_parse(row) for row in rows]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path} is no record of runs ({error}); its columns are {', '.join(COLUMNS)}"
+            f"{path} is not a record of runs ({error}); its columns are {', '.join(COLUMNS)}"
         ) from None
 
 

@@ -76,7 +76,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
     with shown(jobs) as tick:
         if errors := chosen.map(make_shared, list(shared.values()), tick):
             reason = next(iter(errors.values()))
-            raise ValueError(f"What the runs share could not be made: {reason}")
+            raise ValueError(f"The data or model that the runs share could not be made: {reason}")
         errors = chosen.map(do, left, tick)
     for folder, error in errors.items():
         console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")

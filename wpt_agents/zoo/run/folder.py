@@ -41,7 +41,7 @@ def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool)
     path = folder / "config.yaml"
     others = {item.name for item in folder.glob("[!.]*")} - {"lock", "log.txt"}
     if others and not path.exists():
-        raise ValueError(f"{folder} is no run folder: it has no config.yaml; use another --out")
+        raise ValueError(f"{folder} is not a run folder: it has no config.yaml; use another --out")
     if path.exists() and not force:
         section = job.algorithm.section
         keywords = {section: dict(defaults(job.algorithm.agent))}

@@ -95,7 +95,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
             whatever `open_dataset` takes
         :param env: the environment to continue with, if known
-        :param steps: updates in all; the size's own if None, which is 200,000 for `paper`
+        :param steps: updates in all; those of the size if None, 200,000 for `paper`
         :param run_dir: folder of `model.zip`, which is written every 1000 steps, at the end, and on
             Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events. If
             a model is there, training continues from it, on any number of processes

@@ -65,13 +65,13 @@ class Hyperparameters(Keywords):
     max_action_dim: int = count(12, "A, the width that all actions are padded to", Stage.SIZE)
     unimix: float = share(
         0.01,
-        "share of the uniform distribution in the latents' distributions. At 0 the KL of a latent "
-        "of probability 0 would be infinite",
+        "share of the uniform distribution that is mixed into the distributions of the latents, so "
+        "that their KL stays finite",
         Stage.SIZE,
         positive=True,
     )
     zero_init_heads: bool | None = switch(
-        None, "start reward head and critic at zero; the size's own if None", Stage.SIZE
+        None, "start reward head and critic at zero; that of the size if None", Stage.SIZE
     )
     actor_outscale: float = amount(
         1.0, "factor on the initial weights of the actor's last layer", Stage.SIZE
@@ -85,21 +85,21 @@ class Hyperparameters(Keywords):
     )
     data_dependent_init: bool = switch(
         True,
-        "before the first update of a new world model, standardise what its posterior sees by 512 "
-        "images of the data",
+        "before the first update of a new world model, standardise the inputs of its posterior on "
+        "512 images of the data; not in the paper",
         Stage.SIZE,
     )
     compile: bool = switch(
         False,
-        "let `torch.compile` fuse the steps of scan and dream, for a GPU. The first updates take "
+        "compile the recurrent steps with `torch.compile`, for a GPU. The first updates take "
         "minutes, and numbers differ in rounding",
         Stage.SIZE,
     )
 
     fast: bool = switch(
         True,
-        "compute by the faster twins in `wpt_agents.fast` of what `wpt_agents.model` defines; "
-        "False, for debugging, by the definitions alone",
+        "use the faster implementations in `wpt_agents.fast`; False, for debugging, uses the plain "
+        "definitions in `wpt_agents.model`",
         Stage.ACTING,
     )
 
@@ -107,7 +107,9 @@ class Hyperparameters(Keywords):
     batch_size: int = count(16, "B, sequences in a batch", Stage.PRETRAINING)
     batch_length: int = count(64, "T, images in a sequence", Stage.PRETRAINING)
     learning_rate: float | None = amount(
-        None, "of world model and reward head; the size's own if None", Stage.PRETRAINING
+        None,
+        "learning rate of world model and reward head; that of the size if None",
+        Stage.PRETRAINING,
     )
     weight_decay: float = amount(
         1e-6, "share by which every weight shrinks in a step", Stage.PRETRAINING
@@ -117,7 +119,7 @@ class Hyperparameters(Keywords):
     )
     dyn_scale: float = amount(1.0, "weight of the KL that trains the prior", Stage.PRETRAINING)
     rep_scale: float = amount(0.1, "weight of the KL that trains the posterior", Stage.PRETRAINING)
-    free_nats: float = amount(1.0, "KL below which it trains nothing", Stage.PRETRAINING)
+    free_nats: float = amount(1.0, "KL below which it is not minimised further", Stage.PRETRAINING)
     free_nats_mode: str = choice(
         "mean", ("mean", "element"), '"mean" (WPT) or "element" (DreamerV3)', Stage.PRETRAINING
     )
@@ -130,13 +132,13 @@ class Hyperparameters(Keywords):
     precision: str = choice(
         "fp32",
         ("fp32", "bf16"),
-        '"fp32", or "bf16" for the forward passes; on a CPU it pays from `small` on',
+        '"fp32", or "bf16" for the forward passes, on a CPU faster from size `small` on',
         Stage.PRETRAINING,
     )
 
     # Actor and critic.
     actor_critic_learning_rate: float | None = amount(
-        None, "of actor and critic; the size's own if None"
+        None, "learning rate of actor and critic; that of the size if None"
     )
     actor_critic_decay: bool = switch(
         False,
@@ -145,8 +147,8 @@ class Hyperparameters(Keywords):
     )
     actor_average: float = share(
         0.0,
-        "share by which an average of the actors moves to the actor in an update. The average acts "
-        "and is evaluated, dreams are the actor's; not in the paper. 0: the actor itself acts",
+        "share by which a moving average of the actor follows it in an update; the average acts, "
+        "the actor itself imagines. Not in the paper; 0: the actor itself acts",
     )
     gamma: float = share(0.99, "discount factor")
     lam: float = share(0.95, "λ of Eq. (2)")
@@ -154,7 +156,7 @@ class Hyperparameters(Keywords):
         1e-4,
         np.inf,
         "η of Eq. (4), the weight of the entropy: a number, or a schedule such as "
-        "'linear(3e-3,3e-4,20000)', with which the policy commits later than by its end value",
+        "'linear(3e-3,3e-4,20000)', with which exploration fades",
     )
     imagine_horizon: int = count(  # the value of the first state is no action's
         16, "H, imagined steps", least=2
@@ -162,14 +164,14 @@ class Hyperparameters(Keywords):
     imagine_starts: int | None = count(
         None,
         "replayed states of a batch from which actor and critic imagine, drawn at random; 0 for "
-        "all of them, as in the paper; the size's own if None",
+        "all of them, as in the paper; that of the size if None",
         least=0,
     )
     target_fraction: float = share(
         0.02, "share by which the target critic moves to the critic in an update"
     )
     return_norm: bool | None = switch(
-        None, "divide returns by their 5-95 % range, if above 1; the size's own if None"
+        None, "divide returns by their 5-95 % range, if above 1; that of the size if None"
     )
     train_ratio: float = amount(
         256, "replayed steps for each collected step; one update replays B x T of them"
@@ -178,14 +180,14 @@ class Hyperparameters(Keywords):
     kickstart: str | float = schedule(
         0.0,
         np.inf,
-        "weight, or schedule of it, of a loss by which the actor imitates the prior actor on the "
-        "replayed images; not in the paper. 0: off; where the clone is good, try 20",
+        "weight, or a schedule of it, of a loss with which the actor imitates the prior actor on "
+        "replayed images; not in the paper. 0: off; where the prior actor is good, try 20",
     )
     actor_delay: int = count(
         0,
-        "updates of a head start, made when `learning_starts` is reached even if fewer have been "
-        "earned: reward head and critic learn while the actor only imitates the prior actor; not "
-        "in the paper",
+        "updates of a head start, made when `learning_starts` is reached even if `train_ratio` "
+        "allows fewer: reward head and critic learn while the actor only imitates the prior actor; "
+        "not in the paper",
         least=0,
     )
 
@@ -193,17 +195,17 @@ class Hyperparameters(Keywords):
         "dynamics",
         ("dynamics", "reinforce"),
         'gradient of the actor: through the dynamics, as in the paper, or "reinforce" (DreamerV3), '
-        "which needs no gradient through the dream",
+        "which needs no gradient through the imagined steps",
     )
     repval_scale: float = amount(
         0.0,
-        "weight of DreamerV3's replay value loss, which trains the critic on returns that were "
-        "earned; not in the paper. DreamerV3 has 0.3",
+        "weight of DreamerV3's replay value loss, which trains the critic on returns of replayed "
+        "steps; not in the paper. DreamerV3 has 0.3",
     )
     slow_critic_scale: float = amount(
         0.0,
-        "weight of DreamerV3's regulariser that pulls the critic to the target critic's values in "
-        "dreams; not in the paper. DreamerV3 has 1",
+        "weight of DreamerV3's regulariser that pulls the critic to the target critic's values on "
+        "imagined steps; not in the paper. DreamerV3 has 1",
     )
     recent_share: float = share(
         0.0,
@@ -217,13 +219,14 @@ class Hyperparameters(Keywords):
         "states hold only what reconstructing images needs; DreamerV3 has 1",
     )
     reward_ensemble: int = count(
-        1, "reward heads. Of several, dreams are paid the mean, less what `pessimism` takes off"
+        1,
+        "number of reward heads; imagined rewards are their mean, less what `pessimism` subtracts",
     )
     pessimism: str | float = schedule(
         0.0,
         np.inf,
-        "β, or schedule of it: dreams are paid the mean of the reward heads minus β times their "
-        "standard deviation, so that states which no reward is known of are not sought; it should "
+        "β, or a schedule of it: imagined rewards are the mean of the reward heads minus β times "
+        "their standard deviation, so that states of unknown reward are not sought; it should "
         "fade, or exploration stops. Not in the paper",
     )
     continue_head: bool = switch(
@@ -235,23 +238,23 @@ class Hyperparameters(Keywords):
     # Collecting.
     learning_starts: int | None = count(
         None,
-        "steps that are collected before the first update; they earn updates, too; the size's own "
-        "if None, which is 5,000 for `paper`",
+        "steps that are collected before the first update; their updates are then made as well; "
+        "that of the size if None, 5,000 for `paper`",
         Stage.ACTING,
         least=0,
     )
     warmup_steps: int | None = count(
         None,
-        "steps that the prior actor alone drives (uniform random actions without one); the size's "
-        "own if None, which is 7,500 for `paper`",
+        "first steps, in which the prior actor acts alone (without one, uniformly random actions); "
+        "that of the size if None, 7,500 for `paper`",
         Stage.ACTING,
         least=0,
     )
     guidance: str | float | None = schedule(
         None,
         1.0,
-        "schedule of the probability that an episode is guided; 0: no guidance; the size's own if "
-        "None, which is 'linear(1,0,50000)' for `paper`",
+        "schedule of the probability that an episode is guided; 0: no guidance; that of the size "
+        "if None, 'linear(1,0,50000)' for `paper`",
         Stage.ACTING,
     )
     ibrl: bool = switch(
@@ -277,7 +280,7 @@ class Hyperparameters(Keywords):
     # Retrieval and the prior actor.
     num_retrieve: int | None = count(
         None,
-        "R, trajectories to retrieve; the size's own if None, which is 500 for `paper`",
+        "R, trajectories to retrieve; that of the size if None, 500 for `paper`",
         Stage.RETRIEVAL,
     )
     retrieval: str = choice(
@@ -295,17 +298,19 @@ class Hyperparameters(Keywords):
     )
     bc_steps: int | None = count(
         None,
-        "updates of the prior actor; the size's own if None, which is 150,000 for `paper`",
+        "updates of the prior actor; that of the size if None, 150,000 for `paper`",
         Stage.CLONING,
     )
     bc_batch_size: int | None = count(
         None,
-        "images and actions in an update of the prior actor; the size's own if None, which is 256 "
-        "for `paper`",
+        "images and actions in an update of the prior actor; that of the size if None, 256 for "
+        "`paper`",
         Stage.CLONING,
     )
     bc_learning_rate: float = amount(
-        1e-4, "of the prior actor at its first update; it falls linearly to 0", Stage.CLONING
+        1e-4,
+        "learning rate of the prior actor at its first update; it falls linearly to 0",
+        Stage.CLONING,
     )
 
     def __post_init__(self) -> None:

@@ -148,13 +148,13 @@ class Keywords:
     embodiment: str | None = keyword(
         None,
         must("a name", lambda value: isinstance(value, str)),
-        "name of the robot, which is written on the episodes that are collected",
+        "name of the robot, which labels the episodes that are collected",
         Stage.ACTING,
     )
     image_key: str | None = keyword(
         None,
         must("a name", lambda value: isinstance(value, str)),
-        "entry of Dict observations that is the image to see; their only image if None",
+        "the entry of Dict observations that is the image; their only image if None",
         Stage.ACTING,
     )
     learning_starts: int | None = count(
@@ -162,7 +162,7 @@ class Keywords:
     )
     warmup_steps: int | None = count(
         1_000,
-        "steps at the start that uniform random actions drive, to the end of the episode",
+        "first steps, with uniformly random actions, up to the end of an episode",
         Stage.ACTING,
         least=0,
     )
@@ -175,9 +175,9 @@ class Keywords:
     train_freq: str = choice(
         "episode",
         ("episode", "step"),
-        "when the updates that a step has earned are made: 'episode', at its end, or 'step', while "
-        "the environments take the next one. Worker processes (`SubprocVecEnv`) then step at the "
-        "same time; what is learned is the same without them",
+        "when updates are made: 'episode', at the end of each, or 'step', while the environments "
+        "take the next step. Worker processes (`SubprocVecEnv`) then step at the same time; what "
+        "is learned is the same without them",
         Stage.ACTING,
     )
     seed: int | None = count(

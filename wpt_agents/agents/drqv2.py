@@ -128,14 +128,14 @@ class DrQv2Keywords(FrameKeywords):
     channels: int = count(32, "channels of each of the encoder's four layers", Stage.SIZE)
     feature_dim: int = count(50, "width of the actor's and the critic's latent", Stage.SIZE)
     hidden_dim: int = count(1024, "width of the hidden layers of actor and critic", Stage.SIZE)
-    n_steps: int = count(3, "rewards that are summed before the critic's value takes over")
+    n_steps: int = count(3, "rewards in a target, before the value of the target critic")
     tau: float = share(0.01, "share by which the target critic moves to the critic in an update")
     std: str | float = schedule(
         "linear(1,0.1,500000)",
         np.inf,
         "standard deviation of the noise on actions, a number or a schedule over steps. The "
         "published ones last 100,000 steps on easy tasks, 500,000 on medium and 2,000,000 on hard "
-        "ones; shorten it for short runs, or they never act on what they learned",
+        "ones; shorten it for short runs, or the noise never lets the policy act",
     )
     std_clip: float = amount(0.3, "largest noise in targets and in the actor's loss")
     pre_activation: float = amount(
@@ -143,7 +143,7 @@ class DrQv2Keywords(FrameKeywords):
         "weight of the mean square of the actor's output before tanh in its loss, as in MR.Q; not "
         "in DrQ-v2. Short runs need it, or tanh saturates early and recovers slowly",
     )
-    update_every: int = count(2, "collected steps that pay for one update")
+    update_every: int = count(2, "collected steps per update")
 
 
 class DrQv2Policy(FramePolicy):

@@ -41,7 +41,7 @@ class FrameKeywords(Keywords):
     learning_rate: float = amount(1e-4, "learning rate of all networks")
     batch_size: int = count(256, "transitions in a batch")
     gamma: float = share(0.99, "discount of one step")
-    update_every: int = count(1, "collected steps that pay for one update")
+    update_every: int = count(1, "collected steps per update")
     pad: int = count(4, "pixels by which images are shifted at most", least=0)
     task: str | None = keyword(
         None,
@@ -56,8 +56,8 @@ class FrameKeywords(Keywords):
     train_freq: str = choice(
         "step",
         ("episode", "step"),
-        "when the updates that a step has paid for are made: 'step', while the environments take "
-        "the next one, or 'episode', at its end",
+        "when updates are made: 'step', while the environments take the next step, or 'episode', "
+        "at the end of each",
         Stage.ACTING,
     )
 

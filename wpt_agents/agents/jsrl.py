@@ -50,14 +50,14 @@ class JSRLKeywords(DrQv2Keywords):
     )
     warmup_steps: int = count(
         0,
-        "steps at the start that the clone drives alone; DrQ-v2's noise explores instead",
+        "first steps, in which the clone acts alone; by default the noise of DrQ-v2 explores",
         Stage.ACTING,
         least=0,
     )
 
 
 class JSRL(DrQv2, keywords=JSRLKeywords):
-    """DrQ-v2 with a behaviour clone that drives the first steps of each episode.
+    """DrQ-v2 with a behaviour clone that acts in the first steps of each episode.
 
     Example::
 
@@ -65,7 +65,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         model.learn(75_000)
 
     The clone learns from trajectories of the task, or else of the robot. It is the prior actor of
-    WPT. The steps that it drives are learned from like any others; offline data are not.
+    WPT. The agent learns from the steps of the clone as from its own, but not from offline data.
 
     :param policy: "CnnPolicy"
     """

@@ -49,7 +49,7 @@ class MRQKeywords(FrameKeywords):
     learning_rate: float = amount(3e-4, "learning rate of actor and value functions")
     encoder_learning_rate: float = amount(1e-4, "learning rate of the encoder")
     weight_decay: float = amount(1e-4, "weight decay of AdamW")
-    n_steps: int = count(3, "rewards that are summed before the value functions take over")
+    n_steps: int = count(3, "rewards in a target, before the value of the target networks")
     horizon: int = count(5, "steps that the encoder predicts in a row")
     sync_every: int = count(
         250,

@@ -144,7 +144,7 @@ class PackNetKeywords(DrQv2Keywords):
 
     tasks: int = count(6, "tasks in the sequence; each gets an equal share of the weights")
     retrain: float = share(
-        0.1, "updates after the pruning, as a share of the task's own", Stage.TASK
+        0.1, "updates after the pruning, as a share of those before it", Stage.TASK
     )
 
 
@@ -161,7 +161,7 @@ class PackNetProgress(FrameProgress):
 
 
 class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
-    """DrQ-v2 on a sequence of tasks, whose weights are shared out by pruning.
+    """DrQ-v2 on a sequence of tasks; pruning assigns a part of the weights to each task.
 
     Example::
 

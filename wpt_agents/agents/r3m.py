@@ -136,9 +136,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         model.set_env("wpt/dmc-walker-run-v0")
         model.learn(75_000)
 
-    `model.load_weights("r3m_18.pt")` of an agent with `backbone="resnet18"` takes the network that
+    `model.load_weights("r3m_18.pt")` of an agent with `backbone="resnet18"` loads the network that
     R3M's authors publish. There is no augmentation, so each image is encoded once, and its features
-    are kept beside the episode.
+    are stored with the episode.
 
     :param policy: "CnnPolicy"
     """

@@ -89,7 +89,7 @@ class RLPDKeywords(FrameKeywords):
     label: str = choice(
         "true",
         LABELS,
-        "the rewards of offline data: 'true', as the dataset holds them; 'zero' (UDS); or "
+        "the rewards of offline data: 'true', those of the dataset; 'zero' (UDS); or "
         "'optimistic' (ExPLORe), the mean of a reward ensemble and `beta` times its deviation",
         Stage.SIZE,
     )

@@ -225,7 +225,7 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"tasks": [DOT, DOT]}, "different tasks"),
         ({"episodes": 0}, "at least 1 episode"),
         ({"behaviour": "noize"}, "Did you mean 'noise'"),
-        ({"behaviour": "policy"}, "wants policy=FILE"),
+        ({"behaviour": "policy"}, "which needs it"),
         ({"policy": "a.zip"}, "is for the behaviour 'policy'"),
         ({"behaviour": "policy", "policy": "no.zip"}, r"No policy no\.zip"),
         ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),

@@ -120,7 +120,7 @@ def test_a_moved_out_is_not_done_again(tmp_path):
         (["eval", "alone.zip"], "add --task"),
         (["eval", "run", "--task", "dmc-walker-rum"], "Did you mean 'walker-run'"),
         (["enjoy", "run", "--size", "100"], "multiple of 16"),
-        (["enjoy", "run", "--out", "film.avi"], "ends in .mp4 or .gif"),
+        (["enjoy", "run", "--out", "film.avi"], "end in .mp4 or .gif"),
         (["eval", "damaged"], "is not the configuration of a run"),
         (["push", "run", "noname"], "write user/name"),
         (["push", "empty", "user/name"], "holds no model.zip"),

@@ -141,4 +141,4 @@ def test_the_command_shows_the_plan_and_refuses_what_does_not_go_together(
     assert call(monkeypatch, *words, "--dry-run", "--out", tmp_path) == 0
     assert "dmc-quadruped-roll-fast" in capsys.readouterr().out
     assert call(monkeypatch, *words, "--tasks", "walker-run") != 0
-    assert "--sequence takes neither" in capsys.readouterr().err
+    assert "--sequence cannot be combined" in capsys.readouterr().err

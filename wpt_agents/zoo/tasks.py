@@ -1,6 +1,6 @@
 """From what a user types to rows of the task table."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
 
 from wpt_envs import tasks as table
@@ -44,6 +44,17 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
 def short_name(task: Task) -> str:
     """'dmc-walker-run', as folders and tables call it."""
     return f"{task.suite}-{task.name}"
+
+
+def name_in_data(task: Task, names: Collection[str | None]) -> str | None:
+    """Return the name that data have for a task, or None if they have none.
+
+    Data that were collected have its id. The authors' data of Meta-World have its name alone.
+
+    :param names: the tasks of the data
+    """
+    known = (task.id, short_name(task), task.name)
+    return next((name for name in known if name in names), None)
 
 
 def metric_of(task: Task) -> Metric:

@@ -6,7 +6,7 @@ from statistics import mean, median
 import gymnasium as gym
 import numpy as np
 import pytest
-from debug_agent import recorded
+from debug_agent import ClockEnv, recorded
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -229,6 +229,19 @@ def test_every_method_can_be_planned_from_every_preset(method, tmp_path):
         if issubclass(agent, PixelAgent):
             agent.keywords.of(run.keywords)  # names and ranges
         assert run.config() and run.folder and run.shared.model_path
+
+
+@pytest.mark.parametrize("name", ["wpt/metaworld-reach-v0", "metaworld-reach", "reach"])
+def test_baselines_use_data_of_their_task_also_where_imported_data_call_it_otherwise(
+    name, tmp_path
+):
+    with TrajectoryDataset.create(tmp_path / "data") as data:
+        for task in (name, "push"):
+            data.append(recorded(actions=4, embodiment="sawyer", task=task))
+    [run] = plan("metaworld", ["reach"], "debug", tmp_path, "uds")
+    agent = make_agent(run, DummyVecEnv([lambda: ClockEnv(actions=4)]), data, None)
+    agent.prepare(progress_bar=False)
+    assert agent.retrieved_ids == [0]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -29,7 +29,7 @@ from wpt_agents.zoo.run.checkpoints import (
 )
 from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
-from wpt_agents.zoo.tasks import metric_of, short_name
+from wpt_agents.zoo.tasks import metric_of, name_in_data, short_name
 from wpt_agents.zoo.terminal import say
 
 APART = 10_000  # between the seeds of the evaluations during fine-tuning and of those at its end
@@ -89,6 +89,8 @@ def _keywords(run: Run, dataset: TrajectoryDataset | None) -> dict[str, Any]:
     }
     known = {name: value for name, value in task.items() if run.algorithm.takes(name)}
     specific = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
+    if dataset is not None and run.algorithm.takes("task"):
+        specific.setdefault("task", name_in_data(run.task, dataset.tasks))
     return {"seed": run.seed, "device": run.device, **specific, **known}
 
 

@@ -138,10 +138,10 @@ def diagnose(
 
 
 def show(diagnosis: Diagnosis, horizon: int) -> None:
-    """Prints a table of the promises, and what else is known."""
-    title = f"Reward a step over {horizon} steps, and return, from a step on; means over episodes"
+    """Print a table of the promises, the returns, and the error of the reward head."""
+    title = f"From a step on: reward per step over {horizon} steps, and return; means over episodes"
     table = Table(title=title)
-    for name in ("step", "earned", "dream of the same actions", "dream of the actor"):
+    for name in ("step", "earned", "imagined, same actions", "imagined, the actor's"):
         table.add_column(name, justify="right")
     for name in ("critic's value", "discounted return"):
         table.add_column(name, justify="right")
@@ -149,4 +149,6 @@ def show(diagnosis: Diagnosis, horizon: int) -> None:
         table.add_row(f"{row.start:.0f}", *(f"{x:.2f}" for x in astuple(row)[1:]))
     console.print(table)
     console.print(f"Returns: {', '.join(f'{x:.0f}' for x in diagnosis.returns)}")
-    console.print(f"Reward head, on images it sees: {diagnosis.reward_error:.2f} off a step")
+    console.print(
+        f"Error of the reward head on these images: {diagnosis.reward_error:.2f} per step"
+    )

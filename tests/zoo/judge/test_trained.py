@@ -73,7 +73,7 @@ def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
     words = ["--episodes", "2", "--horizon", "10", "--seed", seed]
     assert call(monkeypatch, "diagnose", folder, *words) == 0
     printed = capsys.readouterr().out
-    assert all(word in printed for word in ("earned", "dream of the actor", "discounted return"))
+    assert all(word in printed for word in ("earned", "imagined", "discounted return"))
     rows = re.findall(r"│ +(\d+) │ +(-?[\d.]+) │", printed)
     assert [int(step) for step, _ in rows] == [0, 3, 7, 11, 15]  # five from 0 to 25 - 10
     returns = find_trained(folder).evaluate(find_trained(folder).load(), 1, seed).returns

@@ -99,6 +99,16 @@ def test_each_image_is_encoded_once_and_features_stand_for_images(dataset, monke
     torch.testing.assert_close(embed, same_embed, rtol=1e-2, atol=1e-2)
 
 
+def test_features_are_computed_again_when_other_weights_are_loaded_in_place():
+    model, other = (R3M("CnnPolicy", ClockEnv(), **SETTINGS | {"seed": seed}) for seed in (0, 1))
+    model.learn(7)
+    old = model.seen(model.replay_buffer)[0]
+    model.set_parameters(other.get_parameters())
+    new = model.seen(model.replay_buffer)[0]
+    np.testing.assert_array_equal(new, other.seen(model.replay_buffer)[0])
+    assert (old != new).any()
+
+
 def test_a_loaded_model_goes_on_exactly(dataset, tmp_path):
     start = R3M.pretrain(dataset, steps=1, **SETTINGS)
     start.save(tmp_path / "start")

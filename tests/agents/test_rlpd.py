@@ -83,6 +83,13 @@ def test_half_of_each_batch_is_offline_and_online_rewards_are_kept(dataset, monk
         assert all(r > 0 for r in reward[:4]) and reward[4:] == [0.0] * 4
 
 
+@pytest.mark.parametrize("label", ["true", "optimistic"])
+def test_a_batch_may_be_offline_altogether(label, dataset):
+    model = agent(ClockEnv(), dataset(), label=label, offline_ratio=1)
+    before = weights(model, "critic")
+    assert model.learn(28).updates > 0 and not same(before, weights(model, "critic"))
+
+
 def test_a_dataset_without_rewards_is_refused_by_the_true_label(dataset):
     with pytest.raises(ValueError, match=r"without rewards.*label='zero'"):
         agent(ClockEnv(), dataset(reward=None)).learn(14)

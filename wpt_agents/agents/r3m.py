@@ -171,6 +171,14 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         body.load_state_dict(weights)
         self._features_of = None
 
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Load weights and optimisers in place; what the encoder before made of images is dropped.
+
+        The parameters are those of `SavedAgent.set_parameters`.
+        """
+        super().set_parameters(*args, **kwargs)
+        self._features_of = None
+
     def seen(self, replay: ReplayBuffer) -> list[np.ndarray]:
         """Return the features of each episode, float16, which are computed once."""
         if self._features_of is not replay:

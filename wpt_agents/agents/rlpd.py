@@ -257,10 +257,13 @@ class RLPD(FrameAgent, keywords=RLPDKeywords):
         """Make one update on online and offline transitions."""
         size = self.hyperparameters.batch_size
         offline = round(size * self.hyperparameters.offline_ratio) if self.retrieved else 0
-        batch = self.draw(self.replay_buffer, size - offline, 1, stream=0)
-        if offline:
-            assert self.retrieved is not None
-            batch = concatenate([batch, self.draw(self.retrieved, offline, 1, stream=1)])
+        sources = [(self.replay_buffer, size - offline), (self.retrieved, offline)]
+        parts = [
+            self.draw(replay, rows, 1, stream)
+            for stream, (replay, rows) in enumerate(sources)
+            if replay is not None and rows
+        ]
+        batch = concatenate(parts)
         generator = self.streams.torch(Purpose.UPDATE, self.updates, self.device)
         for name, value in self.learner.update(batch, size - offline, generator).items():
             metrics[name].append(value)

@@ -13,9 +13,11 @@ SETTINGS = {
     "batch_size": 16,
     "batch_length": 8,
     "imagine_horizon": 8,
-    "gamma": 0.95,
+    "imagine_starts": 32,
+    "gamma": 0.9,
     "target_fraction": 0.1,
     "ent_coef": 3e-3,
+    "actor_critic_learning_rate": 1e-3,
     "train_ratio": 64,
     "learning_starts": 250,
     "warmup_steps": 500,
@@ -49,6 +51,6 @@ def test_the_optimum_is_known():
 @pytest.mark.filterwarnings("ignore:.*Monitor.*:UserWarning")
 def test_a_dot_is_pushed_to_its_target_from_scratch(learning_seed):
     model = WPT("WPTPolicy", DotEnv(), seed=learning_seed, **SETTINGS)
-    model.learn(3000)
+    model.learn(2000)
     reached, _ = evaluate_policy(model, DotEnv(), n_eval_episodes=20)
     assert reached >= 0.9 * best_return(20, seed=0)

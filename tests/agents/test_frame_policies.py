@@ -8,7 +8,7 @@ from wpt_agents import JSRL, MRQ, R3M, RLPD, DrQv2, PackNet
 
 NARROW = {"channels": 4, "hidden_dim": 8}
 AGENTS = [
-    (DrQv2, {"feature_dim": 6}),
+    (DrQv2, {"feature_dim": 6, "frame_differences": 4.0}),
     (JSRL, {"feature_dim": 6, "bc_size": "debug"}),
     (MRQ, {"latent_dim": 6}),
     (PackNet, {"feature_dim": 6, "tasks": 2}),

@@ -134,3 +134,8 @@ def test_the_authors_weights_are_taken_and_must_fit_the_backbone(tmp_path):
     assert model.policy.encoder.embed_dim == 3 * 512
     with pytest.raises(ValueError, match="does not fit backbone='conv'"):
         R3M("CnnPolicy", ClockEnv(), **SETTINGS).load_weights(tmp_path / "r3m_18.pt")
+
+
+def test_differences_of_frames_are_refused():
+    with pytest.raises(ValueError, match="R3M encodes single images: leave it at 0"):
+        R3M(frame_differences=4)

@@ -31,6 +31,19 @@ def test_pixels_are_divided_by_255_and_centred_and_colours_of_a_frame_stay_toget
     torch.testing.assert_close(encoder(image), torch.full((1, 62 * 62), 0.3))
 
 
+@pytest.mark.parametrize(("channel", "seen"), [(0, 0.4), (3, -0.8), (6, -0.1)])
+def test_differences_of_neighbouring_frames_replace_all_frames_but_the_newest(channel, seen):
+    encoder = FrameEncoder((1,), (1,), centre=0.5, differences=2.0)
+    nn.init.zeros_(encoder.layers[0].weight)
+    nn.init.constant_(encoder.layers[0].bias, 1.0)  # above ReLU's corner
+    encoder.layers[0].weight.data[0, channel, 1, 1] = 1
+    image = torch.zeros(1, 3, 64, 64, 3, dtype=torch.uint8)
+    for frame, red in enumerate((153, 204, 102)):  # 0.6, 0.8 and 0.4
+        image[:, frame, ..., 0] = red
+    # 2 (0.8 - 0.6) = 0.4, 2 (0.4 - 0.8) = -0.8, 0.4 - 0.5 = -0.1
+    torch.testing.assert_close(encoder(image), torch.full((1, 62 * 62), 1 + seen))
+
+
 def test_initial_weights_are_orthogonal_with_gain_sqrt_2_in_convolutions():
     network = nn.Sequential(nn.Conv2d(9, 4, 3), nn.Linear(8, 5)).apply(orthogonal)
     for layer, gain in zip(network, (2.0, 1.0), strict=True):  # the squared gain

@@ -143,13 +143,20 @@ class DrQv2Keywords(FrameKeywords):
         "weight of the mean square of the actor's output before tanh in its loss, as in MR.Q; not "
         "in DrQ-v2. Short runs need it, or tanh saturates early and recovers slowly",
     )
+    frame_differences: float = amount(
+        0.0,
+        "if above 0, the encoder sees the newest frame and the differences of neighbouring frames "
+        "times this number instead of three frames. It is not in DrQ-v2",
+        Stage.SIZE,
+    )
     update_every: int = count(2, "collected steps per update")
 
 
 class DrQv2Policy(FramePolicy):
     """Encoder, actor, critic and target critic; the target critic has no encoder of its own.
 
-    Its widths are `channels`, `feature_dim` and `hidden_dim` of `DrQv2Keywords`.
+    It is made by `channels`, `feature_dim`, `hidden_dim` and `frame_differences` of
+    `DrQv2Keywords`.
     """
 
     def build(self) -> None:
@@ -165,7 +172,9 @@ class DrQv2Policy(FramePolicy):
 
     def make_encoder(self, channels: int) -> Any:
         """Draw an encoder: a module from frames to (N, `embed_dim`)."""
-        return FrameEncoder((channels,) * 4, (2, 1, 1, 1), centre=0.5).apply(orthogonal)
+        differences = vars(self.widths).get("frame_differences", 0.0)  # not in older files
+        encoder = FrameEncoder((channels,) * 4, (2, 1, 1, 1), centre=0.5, differences=differences)
+        return encoder.apply(orthogonal)
 
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
@@ -244,7 +253,10 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
     policy: DrQv2Policy
     learner: DrQv2Learner
     hyperparameters: DrQv2Keywords
-    shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "feature_dim", "hidden_dim")
+    shape_keywords: ClassVar[tuple[str, ...]] = (
+        *("channels", "feature_dim", "hidden_dim"),
+        "frame_differences",
+    )
 
     def make_learner(self) -> DrQv2Learner:
         """Make the optimisers."""

@@ -119,6 +119,14 @@ class R3MKeywords(DrQv2Keywords):
     backbone: str = choice("conv", BACKBONES, "the encoder of single images", Stage.SIZE)
     clips: int = count(16, "clips in a batch of pre-training", Stage.PRETRAINING, least=2)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.frame_differences:
+            raise ValueError(
+                f"frame_differences={self.frame_differences} needs an encoder of several frames, "
+                "and R3M encodes single images: leave it at 0"
+            )
+
 
 @dataclass(kw_only=True)
 class R3MProgress(FrameProgress):

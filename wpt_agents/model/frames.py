@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -16,6 +17,8 @@ class FrameEncoder(nn.Module):
     :param strides: of each layer
     :param frames: F, the number of frames that are stacked
     :param centre: subtracted from the pixels, which are divided by 255 before
+    :param differences: if above 0, all frames but the newest are replaced by the differences of
+        neighbours times this number, so that small movements are large inputs
     :ivar embed_dim: E, the width of the output
     """
 
@@ -25,10 +28,12 @@ class FrameEncoder(nn.Module):
         strides: Sequence[int],
         frames: int = FRAMES,
         centre: float = 0.0,
+        differences: float = 0.0,
     ) -> None:
         super().__init__()
         assert len(channels) == len(strides), (channels, strides)
         self.centre = centre
+        self.differences = differences
         inputs, side = [3 * frames, *channels[:-1]], IMAGE_SIZE
         self.layers = nn.ModuleList(
             nn.Conv2d(i, o, 3, stride)
@@ -40,7 +45,10 @@ class FrameEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(N, F, 64, 64, 3) uint8, oldest first -> (N, E)."""
-        x = image.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255 - self.centre
+        x = image.permute(0, 1, 4, 2, 3).float() / 255 - self.centre
+        if self.differences:
+            x = torch.cat([self.differences * x.diff(dim=1), x[:, -1:]], 1)
+        x = x.flatten(1, 2)
         for layer in self.layers:
             x = F.relu(layer(x))
         return x.flatten(1)  # no norm and no pooling: DrQ-v2's `Trunk` normalises what follows

@@ -149,7 +149,9 @@ def test_a_model_of_ours_in_their_layout_goes_there_and_back(tmp_path):
 
 
 def test_a_model_whose_gates_lie_otherwise_is_not_exported(tmp_path):
-    with pytest.raises(ValueError, match=r"needs a model of gates='across' and norm_eps=1e-05"):
+    with pytest.raises(
+        ValueError, match=r"needs a model whose size has gates='across' and norm_eps=1e-05"
+    ):
         agent().save_official(tmp_path / "ours.pt")
     assert not list(tmp_path.iterdir())
 

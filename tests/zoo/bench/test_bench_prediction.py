@@ -190,7 +190,7 @@ def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
         dataset.append(clock(43))
     short = CliRunner().invoke(app, [*words[:2], str(pre_trained / "short")])
     assert isinstance(short.exception, ValueError)
-    assert "44 images, but 5 filtered and 40 predicted" in str(short.exception)
+    assert "44 images, but 5 observed and 40 predicted" in str(short.exception)
     still = noise(46)
     with TrajectoryDataset.create(pre_trained / "wide") as dataset:
         dataset.append(Trajectory(still, np.zeros((45, 3), np.float32)))

@@ -30,7 +30,7 @@ def test_a_file_of_the_authors_is_imported_and_exported(tmp_path, monkeypatch, c
     ("words", "message"),
     [
         (("official", "model.zip", "a.zip"), "is for WPT.load"),
-        (("official", "--export", "model.zip", "a.pt"), "needs a model of gates='across'"),
+        (("official", "--export", "model.zip", "a.pt"), "whose size has gates='across'"),
         (("offical", "model.zip", "a.zip"), "No format 'offical'. Did you mean 'official'?"),
         (("official", "nothing.pt", "a.zip"), "There is no model file nothing.pt"),
     ],

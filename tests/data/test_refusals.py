@@ -1,4 +1,4 @@
-"""What is not a dataset is refused by what it is, with a remedy."""
+"""Paths that hold no dataset are refused: the error names what is there, and a remedy."""
 
 import pickle
 import zipfile

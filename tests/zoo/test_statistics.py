@@ -15,6 +15,7 @@ from wpt_agents.zoo.statistics import (
     performance_profile,
     probability_of_improvement,
     resample,
+    sign_test,
 )
 
 TASKS = [np.array([0.0, 1.0]), np.array([0.5, 0.7]), np.array([1.2, 1.4])]
@@ -139,3 +140,9 @@ def test_the_interval_is_students(n):
 
 def test_one_value_has_no_interval():
     assert mean_interval([3.0]) == (3.0, None, None)
+
+
+def test_the_sign_test_by_hand_and_against_scipys():
+    # five of five: 2 (1 / 2^5); four of five: 2 (5 + 1) / 32; as many above as below: certain
+    assert [sign_test(*pair) for pair in ((5, 0), (1, 4), (2, 2), (0, 0))] == [0.0625, 0.375, 1, 1]
+    assert sign_test(30, 12) == pytest.approx(stats.binomtest(30, 42).pvalue)

@@ -7,6 +7,7 @@ statistic takes arrays with leading axes too, as resampling makes them.
 """
 
 from collections.abc import Callable, Sequence
+from math import comb
 
 import numpy as np
 
@@ -94,3 +95,13 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float |
     t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
     half = t * float(np.std(values, ddof=1)) / n**0.5
     return middle, middle - half, middle + half
+
+
+def sign_test(above: int, below: int) -> float:
+    """Return the two-sided p value of the sign test; ties are left out before.
+
+    p = 2 sum_{k >= max(above, below)} C(n, k) / 2^n with n = above + below, and at most 1.
+    """
+    n = above + below
+    tail = sum(comb(n, k) for k in range(max(above, below), n + 1)) / 2**n
+    return min(1.0, 2 * tail)

@@ -37,12 +37,13 @@ def report(
     intervals, learning curves, videos, the command behind each number, and what failed. Markdown
     and CSV files beside it have the numbers of every policy: doing nothing, random, prior actor and
     the agent. A record (--record results.csv) is small enough to keep when the run folders are
-    deleted; results.md and results.png beside it show the same.
+    deleted; results.md and results.png beside it show the same. Where FOLDER has no finished run,
+    these two are written again from the record alone.
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """
     from wpt_agents.zoo.report import record as records
-    from wpt_agents.zoo.report import record_tables, tables
+    from wpt_agents.zoo.report import record_page, tables
     from wpt_agents.zoo.report.figure4 import find_sequences
     from wpt_agents.zoo.report.folders import find_finished, read_results
     from wpt_agents.zoo.report.page import write_page
@@ -53,6 +54,10 @@ def report(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
     results = read_results(folder)
+    if not results and record is not None and record.exists():
+        record_page.write(record, records.read(record))
+        console.print(f"No finished run below {folder}: {record} stays, its pages are renewed.")
+        return
     if not results and not find_sequences(folder):
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows = tables.summarise(results)
@@ -60,8 +65,7 @@ def report(
     as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
     if record is not None:
         lines = records.update(record, records.lines_of(find_finished(folder)))
-        record.with_suffix(".md").write_text(record_tables.markdown(lines), encoding="utf-8")
-        record_tables.draw(record.with_suffix(".png"), lines)
+        record_page.write(record, lines)
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:

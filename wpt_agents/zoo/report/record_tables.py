@@ -1,27 +1,19 @@
-"""A record as tables and as a picture: every task and method, then the suites."""
+"""A record as tables: every task and method, then the suites."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple, Self
 
-import matplotlib
 import numpy as np
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.report.record import Line, place
 from wpt_agents.zoo.report.tables import interval_text, markdown_table, number
 from wpt_agents.zoo.result import Variant
 from wpt_agents.zoo.statistics import Scores, bootstrap, mean, mean_interval
 
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
-
-COLOURS = {"wpt": "#0072b2", "kickstart": "#d55e00"}
-OTHERS = "#777777"
+OURS = ("wpt+", "wpt")  # the methods that a record is about
 
 
 @dataclass(frozen=True)
@@ -70,32 +62,36 @@ class Means(NamedTuple):
 
 
 def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, Means]]:
-    """Return method -> suite -> mean score, and "both" for a method with runs of two suites.
-
-    A method with another budget than that of `wpt` on the suite bears it in its name, "scratch, 3x
-    frames"; where `wpt` has several presets or budgets, the smallest one bears none.
-    """
+    """Return method -> suite -> mean score, and "both" for a method with runs of two suites."""
     usual = usual_budgets(lines)
     groups: dict[str, dict[str, dict[str, list[float]]]] = {}
     for line in lines:
-        frames, preset = usual.get(line.suite, (1, line.preset))
-        ratio = line.frames / frames
-        name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
-        if line.preset != (preset if line.frames else preset.playing):
-            name += f", {line.preset}"
+        name = column(line, *usual.get(line.suite, (1, line.preset)))
         suites = groups.setdefault(name, {})
         suites.setdefault(line.suite, defaultdict(list))[line.task].append(line.score)
     return {method: _means(groups[method]) for method in sorted(groups, key=place)}
 
 
+def column(line: Line, frames: int, preset: Variant) -> str:
+    """Return the method, and what is unusual about its run: "scratch, 3x frames"."""
+    ratio = line.frames / frames
+    name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
+    same = line.preset == (preset if line.frames else preset.playing)
+    return name if same else f"{name}, {line.preset}"
+
+
 def usual_budgets(lines: Sequence[Line]) -> dict[str, tuple[int, Variant]]:
-    """Return the smallest budget and preset of `wpt` on each suite, or of others if it has none."""
-    usual: dict[str, tuple[bool, int, Variant]] = {}
+    """Return the usual number of frames and preset of each suite that has trained policies.
+
+    An unchanged preset comes before a changed one, then the methods `OURS` before others, then the
+    smallest budget.
+    """
+    usual: dict[str, tuple[bool, bool, int, Variant]] = {}
     for line in lines:
         if line.frames:
-            here = line.method != "wpt", line.frames, line.preset
-            usual[line.suite] = min(usual.get(line.suite, here), here)
-    return {suite: (frames, preset) for suite, (_, frames, preset) in usual.items()}
+            rank = bool(line.preset.changes), line.method not in OURS, line.frames, line.preset
+            usual[line.suite] = min(usual.get(line.suite, rank), rank)
+    return {suite: (frames, preset) for suite, (*_, frames, preset) in usual.items()}
 
 
 def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, Means]:
@@ -148,53 +144,7 @@ def markdown(lines: Sequence[Line]) -> str:
         for method, means in by_suite(lines).items()
         for suite, (tasks, cell) in means.items()
     ]
-    return markdown_table(TASK_HEADINGS, rows) + "\n" + markdown_table(SUITE_HEADINGS, suites)
-
-
-def draw(path: Path, lines: Sequence[Line]) -> None:
-    """Draw a panel for each task: the seeds of each method as dots, their mean as a stroke."""
-    tasks = by_task(lines)
-    columns = min(4, len(tasks))
-    height = -(-len(tasks) // columns)
-    figure, panels = plt.subplots(
-        height, columns, figsize=(3.1 * columns, 2.6 * height), squeeze=False, layout="constrained"
+    return (
+        f"## Every run\n\n{markdown_table(TASK_HEADINGS, rows)}\n"
+        f"## Means over tasks\n\n{markdown_table(SUITE_HEADINGS, suites)}"
     )
-    for panel, ((suite, task), methods) in zip(panels.flat, tasks.items(), strict=False):
-        shown = {key: cell for key, cell in methods.items() if not key.method.endswith("last")}
-        _draw_panel(panel, task.removeprefix(f"{suite}-"), shown)
-    for panel in panels.flat[len(tasks) :]:
-        panel.remove()
-    figure.supxlabel("score, 0 to 100\na dot per seed, a stroke at their mean", fontsize=9)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
-
-
-def _draw_panel(panel: Axes, title: str, cells: Mapping[Key, Cell]) -> None:
-    for at, (key, cell) in enumerate(cells.items()):
-        colour = COLOURS.get(key.method, OTHERS)
-        panel.plot(cell.scores, [at] * len(cell.scores), "o", ms=5, color=colour, alpha=0.7)
-        panel.plot([cell.mean] * 2, [at - 0.3, at + 0.3], color=colour, lw=2)
-    panel.set_yticks(range(len(cells)), row_names(cells), fontsize=7.5)
-    panel.set(xlim=(-4, 104), title=title)
-    panel.title.set_fontsize(9)
-    panel.invert_yaxis()
-    panel.grid(axis="x", lw=0.4)
-    panel.spines[["top", "right"]].set_visible(False)
-
-
-def row_names(keys: Iterable[Key]) -> list[str]:
-    """Return the methods; one of several presets or budgets with what tells these apart."""
-    keys = list(keys)
-    presets: dict[str, set[frozenset[str]]] = defaultdict(set)
-    budgets: dict[str, set[int]] = defaultdict(set)
-    for method, preset, frames in keys:
-        presets[method].add(frozenset(preset.words))
-        budgets[method].add(frames)
-    names = []
-    for method, preset, frames in keys:
-        common = frozenset.intersection(*presets[method])
-        changes = [word for word in preset.words if word not in common]
-        budget = [f"{frames:,} frames"] if len(budgets[method]) > 1 else []
-        names.append(", ".join([",\n".join([method, *changes]), *budget]))
-    return names

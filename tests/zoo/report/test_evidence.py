@@ -1,0 +1,171 @@
+"""The pages beside a record: the evidence of each task, the pairs, and the picture."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from wpt_agents.zoo.commands.app import app
+from wpt_agents.zoo.report import evidence, pairs, record, record_page, record_picture
+from wpt_agents.zoo.report.record_tables import usual_budgets
+from wpt_agents.zoo.result import Variant
+
+ROOT = Path(__file__).parents[3]
+
+
+def line(method, task, score, seed=0, preset="mid", frames=12_000, suite="metaworld"):
+    where = suite, f"{suite}-{task}", method, seed, Variant.parse(preset), frames
+    return record.Line(*where, score, 10 * score, None, 0.0, "c", "x")
+
+
+LINES = [
+    *[line("random", task, 0.0, frames=0) for task in ("hammer", "drawer-open", "door-lock")],
+    *[line("wpt+", "hammer", score, seed) for seed, score in enumerate((60.0, 80.0))],
+    *[line("wpt+", "drawer-open", 100.0), line("wpt+", "soccer", 30.0)],
+    *[line("prior actor", "hammer", score, seed) for seed, score in enumerate((40.0, 60.0))],
+    *[line("prior actor", "drawer-open", 100.0), line("prior actor", "soccer", 50.0)],
+    *[line("prior actor", "soccer", 90.0, seed=5)],  # wpt+ has no such seed
+    *[line("scratch", "hammer", 10.0), line("scratch", "hammer", 20.0, frames=36_000)],
+    *[line("scratch", "push", 10.0)],
+    *[line("wpt+", "hammer", 1.0, preset="mid reward_grad=10")],
+    *[line("wpt+", "door-lock", 99.0, preset="mid reward_grad=10")],
+]
+
+
+def rows(markdown):
+    return [row.strip("| ").split(" | ") for row in markdown.splitlines() if row.startswith("|")]
+
+
+def test_a_row_has_the_papers_scores_and_the_mean_of_our_seeds():
+    head, _, *table = rows(evidence.markdown(LINES))
+    assert head == [
+        *("task", "DreamerV3, paper", "DrQ-v2, paper", "WPT, paper"),
+        *("random", "prior actor", "scratch", "scratch, 3x frames", "wpt+"),
+    ]
+    by_task = {row[0]: row[1:] for row in table}
+    assert list(by_task) == ["drawer-open", "hammer", "push", "soccer", "**mean**"]
+    # Table 3: hammer has 0.07, 0.40 and 1.0 at 150k; wpt+ (60 + 80) / 2, prior actor (40 + 60) / 2
+    assert by_task["hammer"] == [
+        "7.0",
+        "40.0",
+        "100",
+        "0.00",
+        "50.0 (2)",
+        "10.0",
+        "20.0",
+        "70.0 (2)",
+    ]
+    assert by_task["push"][4:] == ["-", "10.0", "-", "-"]
+
+
+def test_each_mean_is_over_the_columns_tasks_and_the_papers_over_those_of_ours():
+    *_, mean = rows(evidence.markdown(LINES))
+    # WPT on drawer-open, hammer, soccer, where wpt+ was run (not push): (100 + 100 + 67) / 3 = 89
+    assert mean[3] == "89.0 (3 tasks)"
+    # wpt+: (100 + 70 + 30) / 3 = 66.7; prior actor: (100 + 50 + (50 + 90) / 2) / 3 = 73.3
+    assert (mean[8], mean[5]) == ("66.7 (3 tasks)", "73.3 (3 tasks)")
+    assert (mean[6], mean[7]) == ("10.0 (2 tasks)", "20.0 (1 task)")  # scratch, and 3x frames
+
+
+def test_tasks_that_were_run_with_changed_settings_alone_are_named():
+    *_, last = evidence.markdown(LINES).splitlines()
+    assert last.startswith("Only with changed settings") and last.endswith(": metaworld-door-lock.")
+    changed = [line("wpt", "hammer", 5.0, preset="mid ibrl=true")]
+    assert evidence.evidence(changed) == [] and "metaworld-hammer." in evidence.markdown(changed)
+
+
+def test_the_usual_preset_is_an_unchanged_one_even_if_only_changed_ones_ran_ours():
+    lines = [line("scratch", "a", 1.0), line("wpt", "a", 1.0, preset="mid ibrl=true", frames=9)]
+    assert usual_budgets(lines) == {"metaworld": (12_000, Variant("mid"))}
+
+
+def test_pairs_count_tasks_by_their_common_seeds():
+    by_names = {(pair.first, pair.second): pair for pair in pairs.pairs(LINES)}
+    clone = by_names["wpt+", "prior actor"]
+    # hammer ((60 - 40) + (80 - 60)) / 2 = 20, drawer-open 0, soccer by seed 0 alone: 30 - 50 = -20
+    assert sorted(clone.differences) == [-20, 0, 20]
+    assert clone.cells[:6] == ["metaworld", "wpt+", "prior actor", "3", "1", "1"]
+    assert clone.cells[6:] == ["1", "0.00 (-20.0 to 20.0)", "1"]
+    # scratch has seed 0 of hammer alone: 60 - 10. A single task has no interval
+    assert by_names["wpt+", "scratch"].cells[3:] == ["1", "1", "0", "0", "50.0 (-)", "1"]
+    # the paper: hammer 70 - 100, drawer-open 100 - 100, soccer 30 - 67
+    assert sorted(by_names["wpt+", pairs.PAPER_WPT].differences) == pytest.approx([-37, -30, 0])
+    assert set(by_names) == {("wpt+", name) for name in ("prior actor", "scratch", pairs.PAPER_WPT)}
+
+
+def test_five_wins_of_five_are_a_p_value_of_a_sixteenth_and_two_suites_are_added_up():
+    lines = [
+        line(method, f"task-{i}", score, suite=suite, frames=frames)
+        for suite, tasks, frames in (("dmc", 2, 40_000), ("metaworld", 3, 12_000))
+        for i in range(tasks)
+        for method, score in (("wpt+", 50.0), ("scratch", 50.0 - 10 * (i + 1)))
+    ]
+    # differences 10 20 and 10 20 30, so 18 on average; p = 2 / 2^5
+    *_, both = pairs.pairs(lines)
+    assert both.cells[:7] == ["all", "wpt+", "scratch", "5", "5", "0", "0"]
+    assert both.cells[7].startswith("18.0 (") and both.cells[8] == "0.062"
+
+
+def test_pairs_never_use_a_policy_that_was_chosen_by_evaluations():
+    best = [line("wpt", "hammer", 90.0), line("wpt, last", "hammer", 40.0)]
+    (pair,) = pairs.pairs([*best, line("prior actor", "hammer", 50.0)])
+    assert (pair.first, pair.differences) == ("wpt", (-10,))
+    assert "`METHOD, last`" in evidence.markdown(best)
+    assert "`METHOD, last`" not in evidence.markdown(LINES)
+
+
+def test_a_record_of_many_tasks_is_drawn_in_rows_and_one_of_few_in_panels(monkeypatch, tmp_path):
+    drawn = []
+    for name in ("draw_rows", "draw_panels"):
+        draw = getattr(record_picture, name)
+        monkeypatch.setattr(record_picture, name, lambda x, d=draw, n=name: drawn.append(n) or d(x))
+    many = [line("wpt+", f"task-{i}", 50.0) for i in range(9)]
+    changed = [line("wpt+", f"task-{i}", 9.0, preset="mid x=1") for i in range(9, 12)]
+    for lines in (many, many[:8] + changed, changed):
+        record_picture.draw(tmp_path / "a.png", lines)
+    assert drawn == ["draw_rows", "draw_panels", "draw_panels"]
+
+
+def test_rows_leave_out_changed_settings_and_show_the_papers_score_hollow():
+    (panel,) = record_picture.draw_rows(evidence.evidence(LINES)).axes
+    drawn = {curve.get_label(): list(curve.get_xdata()) for curve in panel.get_lines()}
+    names = ["random", "prior actor", "scratch", "scratch, 3x frames", "wpt+"]
+    paper = "the paper's WPT, 150,000 frames"
+    assert list(drawn) == [*names, paper]
+    assert sorted(drawn["wpt+"]) == [30, 70, 100]  # neither 1 nor 99
+    assert panel.get_lines()[-1].get_markerfacecolor() == "none"
+    assert [tick.get_text() for tick in panel.get_yticklabels()] == [
+        *("drawer-open", "hammer", "push", "soccer")
+    ]
+
+
+def test_labels_of_several_lines_have_room_in_a_panel():
+    lines = [line("wpt", "hammer", 5.0, preset=f"mid x={i} y={i}") for i in range(3)]
+    figure = record_picture.draw_panels(lines)
+    figure.draw_without_rendering()
+    boxes = [tick.get_window_extent() for tick in figure.axes[0].get_yticklabels()]
+    assert len(boxes) == 4  # with the paper's
+    assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))
+
+
+def test_pages_are_renewed_without_run_folders(tmp_path):
+    path = tmp_path / "mid.csv"
+    record.update(path, LINES)
+    before = path.read_bytes()
+    ran = CliRunner().invoke(app, ["report", str(tmp_path / "none"), "--record", str(path)])
+    assert ran.exit_code == 0, ran.output
+    assert path.read_bytes() == before and path.with_suffix(".png").stat().st_size > 1000
+    assert path.with_suffix(".md").read_text() == record_page.markdown(record.read(path))
+
+
+def test_a_record_that_does_not_exist_needs_runs(tmp_path):
+    words = ["report", str(tmp_path / "none"), "--record", str(tmp_path / "mid.csv")]
+    assert "No finished run below" in str(CliRunner().invoke(app, words).exception)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["mid", "small-benchmark", "tried"])
+def test_the_tables_in_the_repository_are_those_of_its_records(name):
+    path = ROOT / "zoo" / "results" / f"{name}.csv"
+    assert record_page.markdown(record.read(path)) == path.with_suffix(".md").read_text()

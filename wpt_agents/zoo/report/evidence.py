@@ -1,0 +1,157 @@
+"""The evidence of a record: a row per task, the paper's scores beside ours with the usual preset.
+
+Runs with changed settings are left out here; the table of every run has them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+from wpt_agents.files.names import counted
+from wpt_agents.zoo.report.aggregates import STATISTICS, normalised, references
+from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.record import Line, place
+from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
+from wpt_agents.zoo.report.tables import markdown_table, number
+from wpt_agents.zoo.result import Variant
+
+PAPER = {"dreamer-v3": "DreamerV3, paper", "drq-v2": "DrQ-v2, paper", "wpt": "WPT, paper"}
+UNITS = {"dmc": "a tenth of the mean return", "metaworld": "the success rate in percent"}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The scores of a suite's runs whose preset was not changed, 0 to 100.
+
+    :param frames: the usual budget; a column with another one has it in its name
+    :param scores: column -> task -> seed -> score
+    :param paper: method -> task -> the paper's score at 150,000 frames
+    """
+
+    suite: str
+    preset: Variant
+    frames: int
+    scores: Mapping[str, Mapping[str, Mapping[int, float]]]
+    paper: Mapping[str, Mapping[str, float]]
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks with a trained policy."""
+        return sorted({task for tasks in self.scores.values() for task in tasks})
+
+    @property
+    def ours(self) -> str | None:
+        """The method that the paper's mean is compared with."""
+        return next((method for method in OURS if method in self.scores), None)
+
+    def means(self, name: str) -> dict[str, float]:
+        """Return the mean over seeds of each task of a column."""
+        return {task: fmean(seeds.values()) for task, seeds in self.scores[name].items()}
+
+
+def usual_lines(lines: Sequence[Line]) -> list[Line]:
+    """Return the lines with an unchanged preset, of tasks with a trained policy among them."""
+    budgets = usual_budgets(lines)
+    presets = {suite: preset for suite, (_, preset) in budgets.items() if not preset.changes}
+    usual = [
+        line
+        for line in lines
+        if (preset := presets.get(line.suite)) and line.preset in (preset, preset.playing)
+    ]
+    trained = {line.task for line in usual if line.frames}
+    return [line for line in usual if line.task in trained]
+
+
+def evidence(lines: Sequence[Line]) -> list[Evidence]:
+    """Return what the record says about each suite with runs of an unchanged preset."""
+    budgets = usual_budgets(lines)
+    suites: dict[str, dict[str, dict[str, dict[int, float]]]] = {}
+    for line in sorted(usual_lines(lines), key=_by_column):
+        name = column(line, *budgets[line.suite])
+        columns = suites.setdefault(line.suite, {})
+        columns.setdefault(name, {}).setdefault(line.task, {})[line.seed] = line.score
+    return [
+        Evidence(suite, budgets[suite][1], budgets[suite][0], columns, paper_scores(suite))
+        for suite, columns in suites.items()
+    ]
+
+
+def _by_column(line: Line) -> tuple[str, int, str, int]:
+    return line.suite, place(line.method), line.method, line.frames
+
+
+def paper_scores(suite: str) -> dict[str, dict[str, float]]:
+    """Return the paper's scores at 150,000 frames by method and task, 0 to 100."""
+    metric = "return" if suite == "dmc" else "success"
+    scores: dict[str, dict[str, float]] = {method: {} for method in PAPER}
+    for row in references():
+        counts = (row.suite, row.samples) == (suite, PAPER_BUDGET) and row.task not in STATISTICS
+        if counts and row.method in PAPER and row.score is not None:
+            scores[row.method][row.task] = 100 * normalised(row.score, metric)
+    return scores
+
+
+def markdown(lines: Sequence[Line]) -> str:
+    """Return a table for each suite, with a sentence about what it compares."""
+    suites = evidence(lines)
+    parts = [
+        f"## {SUITES.get(one.suite, one.suite)}\n\n{explanation(one)}\n{table(one)}"
+        for one in suites
+    ]
+    shown = {task for one in suites for task in one.tasks}
+    if changed := sorted({line.task for line in lines if line.frames} - shown):
+        parts.append(
+            f"Only with changed settings, and so under [every run](#every-run) alone: "
+            f"{', '.join(changed)}.\n"
+        )
+    return "\n".join(parts)
+
+
+def explanation(one: Evidence) -> str:
+    """Return what the columns of a table and its last row mean."""
+    unit = UNITS.get(one.suite, " or ".join(UNITS.values()))
+    text = (
+        f"A score is {unit}, averaged over seeds; their number is in brackets where there are "
+        f"several. A method's column is its last policy after {one.frames:,} frames with the "
+        f"unchanged preset `{one.preset}`; the paper's columns are at {PAPER_BUDGET:,} frames. "
+    )
+    if any(f"{name}, last" in one.scores for name in one.scores):
+        text += (
+            "But where there is a column `METHOD, last`, the column `METHOD` is the policy that "
+            "did best in evaluations during training. "
+        )
+    text += "The last row averages every column over the tasks with a score, and counts them"
+    if one.ours is not None:
+        text += f"; in the paper's columns only tasks with a score of `{one.ours}` count"
+    return f"{text}. Only means over the same tasks can be compared.\n"
+
+
+def table(one: Evidence) -> str:
+    """Return the table of a suite: the paper's columns, ours, and a row of means."""
+    columns: dict[str, list[str]] = {}
+    for method, title in PAPER.items():
+        theirs = {task: one.paper[method][task] for task in one.tasks if task in one.paper[method]}
+        compared = one.tasks if one.ours is None else one.scores[one.ours]
+        if theirs:
+            cells = [number(theirs.get(task)) for task in one.tasks]
+            columns[title] = [
+                *cells,
+                mean_cell([theirs[task] for task in compared if task in theirs]),
+            ]
+    for name, tasks in one.scores.items():
+        cells = [seeds_cell(tasks.get(task, {})) for task in one.tasks]
+        columns[name] = [*cells, mean_cell(list(one.means(name).values()))]
+    names = [*(task.removeprefix(f"{one.suite}-") for task in one.tasks), "**mean**"]
+    return markdown_table(["task", *columns], zip(names, *columns.values(), strict=True))
+
+
+def seeds_cell(seeds: Mapping[int, float]) -> str:
+    """Write the mean over seeds: "62.5 (4)"."""
+    if not seeds:
+        return "-"
+    return number(fmean(seeds.values())) + (f" ({len(seeds)})" if len(seeds) > 1 else "")
+
+
+def mean_cell(scores: Sequence[float]) -> str:
+    """Write the mean over tasks: "62.5 (50 tasks)"."""
+    return f"{number(fmean(scores))} ({counted(len(scores), 'task')})" if scores else "-"

@@ -70,7 +70,7 @@ def test_each_mean_is_over_the_columns_tasks_and_the_papers_over_those_of_ours()
 
 def test_tasks_that_were_run_with_changed_settings_alone_are_named():
     *_, last = evidence.markdown(LINES).splitlines()
-    assert last.startswith("Only with changed settings") and last.endswith(": metaworld-door-lock.")
+    assert "only run with changed settings" in last and last.endswith(": metaworld-door-lock.")
     changed = [line("wpt", "hammer", 5.0, preset="mid ibrl=true")]
     assert evidence.evidence(changed) == [] and "metaworld-hammer." in evidence.markdown(changed)
 

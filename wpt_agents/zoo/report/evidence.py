@@ -101,8 +101,8 @@ def markdown(lines: Sequence[Line]) -> str:
     shown = {task for one in suites for task in one.tasks}
     if changed := sorted({line.task for line in lines if line.frames} - shown):
         parts.append(
-            f"Only with changed settings, and so under [every run](#every-run) alone: "
-            f"{', '.join(changed)}.\n"
+            "Tasks that were only run with changed settings or another preset are under "
+            f"[every run](#every-run) alone: {', '.join(changed)}.\n"
         )
     return "\n".join(parts)
 

@@ -121,7 +121,7 @@ def test_a_record_of_many_tasks_is_drawn_in_rows_and_one_of_few_in_panels(monkey
         draw = getattr(record_picture, name)
         monkeypatch.setattr(record_picture, name, lambda x, d=draw, n=name: drawn.append(n) or d(x))
     many = [line("wpt+", f"task-{i}", 50.0) for i in range(9)]
-    changed = [line("wpt+", f"task-{i}", 9.0, preset="mid x=1") for i in range(9, 12)]
+    changed = [line("wpt+", f"task-{i}", 9.0, preset="mid x=1") for i in range(9, 18)]
     for lines in (many, many[:8] + changed, changed):
         record_picture.draw(tmp_path / "a.png", lines)
     assert drawn == ["draw_rows", "draw_panels", "draw_panels"]
@@ -159,10 +159,14 @@ def test_pages_are_renewed_without_run_folders(tmp_path):
     assert path.with_suffix(".md").read_text() == record_page.markdown(record.read(path))
 
 
-def test_a_record_that_does_not_exist_needs_runs(tmp_path):
-    words = ["report", str(tmp_path / "none"), "--record", str(tmp_path / "mid.csv")]
+def test_a_record_that_does_not_exist_or_is_empty_needs_runs(tmp_path):
+    path = tmp_path / "mid.csv"
+    words = ["report", str(tmp_path / "none"), "--record", str(path)]
     assert "No finished run below" in str(CliRunner().invoke(app, words).exception)
     assert not list(tmp_path.iterdir())
+    record.update(path, [])
+    assert "No finished run below" in str(CliRunner().invoke(app, words).exception)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("name", ["mid", "small-benchmark", "tried"])

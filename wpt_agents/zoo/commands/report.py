@@ -54,8 +54,8 @@ def report(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
     results = read_results(folder)
-    if not results and record is not None and record.exists():
-        record_page.write(record, records.read(record))
+    if not results and record is not None and record.exists() and (kept := records.read(record)):
+        record_page.write(record, kept)
         console.print(f"No finished run below {folder}: {record} stays, its pages are renewed.")
         return
     if not results and not find_sequences(folder):

@@ -59,9 +59,9 @@ PAPER_NAME = f"the paper's WPT,\n{PAPER_BUDGET:,} frames"
 
 def draw(path: Path, lines: Sequence[Line]) -> None:
     """Draw the record with as much detail as its number of tasks allows."""
-    usual = usual_lines(lines) or lines
+    usual = usual_lines(lines)
     many = len({line.task for line in usual}) > PANELS
-    figure = draw_rows(evidence(usual)) if many else draw_panels(usual)
+    figure = draw_rows(evidence(usual)) if many else draw_panels(usual or lines)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     plt.close(figure)

@@ -56,6 +56,14 @@ def test_an_environment_of_ones_own_is_learnt_in(example, capsys):
 
 
 @pytest.mark.slow
+def test_a_continue_head_is_compared_with_none(example, capsys):
+    changes = SMALL | {"size": "debug", "imagine_starts": None, "learning_starts": 20}
+    returns = example("episodes_that_end").main("InvertedPendulum-v5", 60, 1, **changes)
+    assert {name: len(values) for name, values in returns.items()} == {"without": 1, "with": 1}
+    assert "seed 0, with a continue head: return" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_pretraining_is_compared_with_scratch(example, tmp_path):
     compare = example("compare_baseline").main
     scores = compare(2, 50, tmp_path / "data", pretrain_steps=2, **SMALL | {"size": "debug"})

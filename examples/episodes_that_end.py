@@ -4,7 +4,7 @@
 
 The reward of such tasks is nearly the same at every step, and what counts is to stay in the
 episode. A continue head predicts from the world model's state whether the episode goes on, so that
-imagined returns end where the episode would. `WPT` adds one by itself once an episode has
+imagined returns end where the episode would. `WPT` adds one automatically once an episode has
 terminated; this script switches it off for comparison.
 """
 

@@ -83,7 +83,7 @@ def measured(seed: int, changes: Mapping[str, Any]) -> dict[str, float]:
 
 
 def main(seeds: int, only: list[str]) -> None:
-    """Print a row for each variant as it is done."""
+    """Print a row as soon as a variant is measured."""
     for name in only or VARIANTS:
         runs = [measured(seed, VARIANTS[name]) for seed in range(seeds)]
         shares = " ".join(f"{run['share of the optimum']:.2f}" for run in runs)

@@ -814,7 +814,7 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
             mode = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
             error = (mode - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
             by_hand += [error.mean().item()] * (t >= 2)
-    loss = model.learner.imitation_loss(post, batch)
+    loss = model.learner.imitation_loss(post, model.learner.advice(batch))
     assert model.num_timesteps == 50  # half way from 20 to 0
     assert model.hyperparameters.kickstart_at(50) == 10
     assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-4)
@@ -836,6 +836,34 @@ def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
     assert WPT("WPTPolicy", size="debug").kickstart == 0
 
 
+def test_imitation_trains_the_states_only_if_imitation_grad_says_so(store):
+    model = pretrained(store, env=DotEnv(), kickstart=5).learn(2 * LENGTH)
+    policy, before = model.policy, deepcopy(model.policy.state_dict())
+    taught = []
+    for weight in (0, 100):
+        policy.load_state_dict(before)
+        model.learner = model.make_learner()
+        model.imitation_grad = weight
+        model.updates = 0
+        model.update(defaultdict(list))
+        taught.append(weights(model))
+    moved = {".".join(k.split(".")[:2]) for k in before if (taught[0][k] != taught[1][k]).any()}
+    assert {"world_model.encoder", "world_model.rssm"} <= moved
+
+
+def test_the_loss_of_the_states_is_the_weighted_imitation_and_leaves_the_actor_fixed(store):
+    model = pretrained(store, env=DotEnv(), imitation_grad=7.0).learn(2 * LENGTH)
+    post, batch = replayed(model)
+    advice = model.learner.advice(batch)
+    deter = post.deter.requires_grad_()
+    loss = model.learner.states_loss(post._replace(deter=deter), advice)
+    assert loss.item() == pytest.approx(7 * model.learner.imitation_loss(post, advice).item())
+    model.policy.actor.zero_grad()
+    loss.backward()
+    assert deter.grad.abs().sum() > 0
+    assert all(p.grad is None and p.requires_grad for p in model.policy.actor.parameters())
+
+
 @pytest.mark.slow
 def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
     distances = []
@@ -845,7 +873,9 @@ def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
             **{"env": DotEnv(), "kickstart": kickstart, "guidance": 1, "train_ratio": 8},
             **{"actor_critic_learning_rate": 3e-3, "bc_steps": 30, "return_norm": True},
         ).learn(4 * LENGTH)
-        distances.append(model.learner.imitation_loss(*replayed(model)).item())
+        post, batch = replayed(model)
+        loss = model.learner.imitation_loss(post, model.learner.advice(batch))
+        distances.append(loss.item())
     assert distances[1] < 0.2 * distances[0]
 
 

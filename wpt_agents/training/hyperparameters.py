@@ -218,6 +218,12 @@ class Hyperparameters(Keywords):
         "weight of the reward loss in the training of the world model. At 0, as in the paper, "
         "states hold only what reconstructing images needs; DreamerV3 has 1",
     )
+    imitation_grad: float = amount(
+        0.0,
+        "weight of the imitation loss (`kickstart`, `actor_delay`) in the training of the world "
+        "model, so that states hold what the prior actor's actions depend on. The loss is small: "
+        "weights of some hundreds have an effect. Not in the paper",
+    )
     reward_ensemble: int = count(
         1,
         "number of reward heads; imagined rewards are their mean, less what `pessimism` subtracts",

@@ -1,5 +1,6 @@
 """// Update Models of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -83,11 +84,15 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        post, metrics = self.update_world_model(batch, generator, learn_reward=True)
+        advice = self.advice(batch) if imitation_weight else None
+        states_loss = None
+        if advice is not None and self.hyperparameters.imitation_grad:
+            states_loss = partial(self.states_loss, advice=advice)
+        post, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         imitation = None
-        if imitation_weight:
-            loss = self.imitation_loss(post, batch)
+        if advice is not None:
+            loss = self.imitation_loss(post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
         starts = self.draw_starts(batch, generator)
@@ -100,19 +105,28 @@ class Learner(WorldModelLearner):
         metrics |= self.update_behavior(start, starts, generator, imitation, head_start, grounding)
         return metrics
 
-    def imitation_loss(self, post: Latent, batch: Batch) -> Tensor:
+    @torch.no_grad()
+    def advice(self, batch: Batch) -> Tensor:
+        """Return the prior actor's actions on the replayed images, (B (T - 2), A)."""
+        policy = self.policy
+        seen = recent_frames(batch.image, batch.is_first).flatten(0, 1)
+        with self.autocast():
+            return policy.prior_actor.act(seen, policy.action_mask)
+
+    def imitation_loss(self, post: Latent, advice: Tensor) -> Tensor:
         """Kickstarting: how far the actor is from the prior actor on the replayed images.
 
         The paper does not have it. Source: https://arxiv.org/abs/1803.03835
         """
-        policy = self.policy
-        mask = policy.action_mask
-        seen = recent_frames(batch.image, batch.is_first).flatten(0, 1)
+        mask = self.policy.action_mask
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
         with self.autocast():
-            with torch.no_grad():
-                advice = policy.prior_actor.act(seen, mask)
-            return bc_loss(policy.actor.dist(feat, mask).mode, advice, mask)
+            return bc_loss(self.policy.actor.dist(feat, mask).mode, advice, mask)
+
+    def states_loss(self, post: Latent, advice: Tensor) -> Tensor:
+        """Return the loss by which imitation trains the states, weighted; the actor is fixed."""
+        with frozen(self.policy.actor):
+            return self.hyperparameters.imitation_grad * self.imitation_loss(post, advice)
 
     def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
         """DreamerV3's replay value loss, on the rows whose rewards are known.

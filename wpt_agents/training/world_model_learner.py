@@ -1,5 +1,6 @@
 """The updates of the world model and the heads of a task: Eq. (1) and the reward likelihood."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -74,13 +75,18 @@ class WorldModelLearner:
             group["weight_decay"] = descent.decay(rate, self.hyperparameters.weight_decay)
 
     def update_world_model(
-        self, batch: Batch, generator: Generator, learn_reward: bool = False
+        self,
+        batch: Batch,
+        generator: Generator,
+        learn_reward: bool = False,
+        states_loss: Callable[[Latent], Tensor] | None = None,
     ) -> tuple[Latent, Metrics]:
         """Take a step on Eq. (1), and on the reward likelihood.
 
         The likelihood trains the reward head and, by the weight `reward_grad`, the states: not at
         all in the paper (Algorithm 1, r_ξ).
 
+        :param states_loss: a further loss of the posterior states (B, T, ...), which trains them
         :return: the posterior states (B, T, ...), without gradient
         """
         model = self.policy.world_model
@@ -94,6 +100,8 @@ class WorldModelLearner:
                 reward = reward_loss(logits, batch.reward, batch.reward_known, model.bin_range)
                 total = total + reward
                 metrics["train/reward_loss"] = reward.detach()
+            if states_loss is not None:
+                total = total + states_loss(post)
         norm = self.descend(self.model_optimizer, total, "world model")
         post = post.detach()
         if learn_reward:

@@ -35,6 +35,7 @@ from wpt_agents.model.rssm import Latent
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner, Metrics
 from wpt_agents.training.randomness import Purpose
+from wpt_agents.training.world_model_learner import StatesLoss
 
 # Keywords of WPT for exploring: nothing to retrieve, nobody to guide, two random episodes first.
 EXPLORE: Mapping[str, Any] = {
@@ -72,7 +73,11 @@ class ICMLearner(CuriousLearner):
     """The reward head learns the forward model's error on real transitions."""
 
     def update_world_model(
-        self, batch: Batch, generator: Generator, learn_reward: bool = False
+        self,
+        batch: Batch,
+        generator: Generator,
+        learn_reward: bool = False,
+        states_loss: StatesLoss | None = None,
     ) -> tuple[Latent, Metrics]:
         """Train the curiosity on a batch, then the world model with surprise as the reward."""
         icm = self.policy.curiosity
@@ -89,7 +94,7 @@ class ICMLearner(CuriousLearner):
         reward[:, 1:] = icm.scale(surprise.detach())
         known[:, 1:] = within
         batch = replace(batch, reward=reward, reward_known=known)
-        post, metrics = super().update_world_model(batch, generator, learn_reward)
+        post, metrics = super().update_world_model(batch, generator, learn_reward, states_loss)
         return post, metrics | {"explore/surprise": surprise.detach().mean()}
 
 
@@ -104,10 +109,14 @@ class Plan2ExploreLearner(CuriousLearner):
     arrival: Tensor  # (B*T,), the pay of the replayed states, from some of which dreams start
 
     def update_world_model(
-        self, batch: Batch, generator: Generator, learn_reward: bool = False
+        self,
+        batch: Batch,
+        generator: Generator,
+        learn_reward: bool = False,
+        states_loss: StatesLoss | None = None,
     ) -> tuple[Latent, Metrics]:
         """Train the world model without the task's reward, then the ensemble on its states."""
-        post, metrics = super().update_world_model(batch, generator)
+        post, metrics = super().update_world_model(batch, generator, states_loss=states_loss)
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         within = ~batch.is_first[:, 1:]

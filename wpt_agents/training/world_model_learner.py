@@ -18,6 +18,8 @@ from wpt_agents.model.world_model import WorldModelLoss, reward_loss, world_mode
 from wpt_agents.training import descent
 from wpt_agents.training.hyperparameters import Hyperparameters
 
+StatesLoss = Callable[[Latent], Tensor]
+"""Posterior states (B, T, ...) -> a scalar that is added to the world model's loss."""
 Metrics = dict[str, Tensor]  # scalars without gradient, by their names in the log
 
 
@@ -79,14 +81,14 @@ class WorldModelLearner:
         batch: Batch,
         generator: Generator,
         learn_reward: bool = False,
-        states_loss: Callable[[Latent], Tensor] | None = None,
+        states_loss: StatesLoss | None = None,
     ) -> tuple[Latent, Metrics]:
         """Take a step on Eq. (1), and on the reward likelihood.
 
         The likelihood trains the reward head and, by the weight `reward_grad`, the states: not at
         all in the paper (Algorithm 1, r_ξ).
 
-        :param states_loss: a further loss of the posterior states (B, T, ...), which trains them
+        :param states_loss: a further loss, which trains the states
         :return: the posterior states (B, T, ...), without gradient
         """
         model = self.policy.world_model

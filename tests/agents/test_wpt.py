@@ -820,35 +820,31 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
     assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-4)
 
 
-def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
-    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
-    policy, before = model.policy, deepcopy(model.policy.state_dict())
+def moved_by(model, keyword, value):
+    """The weights that an update changes otherwise if `keyword` is `value` instead of 0."""
+    before = deepcopy(model.policy.state_dict())
     taught = []
-    for weight in (0, 5):
-        policy.load_state_dict(before)
+    for weight in (0, value):
+        model.policy.load_state_dict(before)
         model.learner = model.make_learner()
-        model.kickstart = weight
+        setattr(model, keyword, weight)
         model.updates = 0
         model.update(defaultdict(list))
         taught.append(weights(model))
-    moved = {k.split(".")[0] for k in before if (taught[0][k] != taught[1][k]).any()}
-    assert moved == {"actor"}
+    return {name for name in before if (taught[0][name] != taught[1][name]).any()}
+
+
+def test_kickstarting_teaches_the_actor_alone_and_is_off_by_default(store):
+    model = pretrained(store, env=DotEnv()).learn(2 * LENGTH)
+    assert {name.split(".")[0] for name in moved_by(model, "kickstart", 5)} == {"actor"}
     assert WPT("WPTPolicy", size="debug").kickstart == 0
 
 
 def test_imitation_trains_the_states_only_if_imitation_grad_says_so(store):
     model = pretrained(store, env=DotEnv(), kickstart=5).learn(2 * LENGTH)
-    policy, before = model.policy, deepcopy(model.policy.state_dict())
-    taught = []
-    for weight in (0, 100):
-        policy.load_state_dict(before)
-        model.learner = model.make_learner()
-        model.imitation_grad = weight
-        model.updates = 0
-        model.update(defaultdict(list))
-        taught.append(weights(model))
-    moved = {".".join(k.split(".")[:2]) for k in before if (taught[0][k] != taught[1][k]).any()}
+    moved = {".".join(name.split(".")[:2]) for name in moved_by(model, "imitation_grad", 100)}
     assert {"world_model.encoder", "world_model.rssm"} <= moved
+    assert WPT("WPTPolicy", size="debug").imitation_grad == 0
 
 
 def test_the_loss_of_the_states_is_the_weighted_imitation_and_leaves_the_actor_fixed(store):

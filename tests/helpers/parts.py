@@ -5,7 +5,7 @@
 
 Every variant changes one keyword (or two that belong together) of the settings of `make learn`, and
 learns for 1,000 steps, half of what `make learn` takes, so that faster and slower learning differ.
-The printed columns, means over seeds with the single values of the first:
+The columns are means over the seeds; the first also shows the value of each seed:
 
 * the return of 20 episodes as a share of the known optimum;
 * the mean absolute error of the critic's value, against the discounted return that followed;
@@ -36,7 +36,7 @@ from wpt_agents.zoo.judge.diagnosis import promises
 from wpt_agents.zoo.judge.evaluation import acting
 
 STEPS, EPISODES = 1000, 20
-STARTS = range(6)  # 19 steps remain after the last, and 0.9 ** 19 = 0.14
+STARTS = range(6)  # 20 steps remain from the last on, and 0.9 ** 20 = 0.12
 VARIANTS: dict[str, dict[str, Any]] = {
     "make learn's settings": {},
     "imagine_starts=None": {"imagine_starts": None},

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -125,6 +126,10 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         members = {name.split(".")[2] for name in weights if name.startswith(start)}
         model.make_reward_members(self.member_seeds(len(members)))
         self.learner.add_reward_members()
+        policy = self.policy
+        imitates = any(name.startswith("imitator.") for name in weights)
+        policy.imitator = deepcopy(policy.actor) if imitates else None
+        self.learner.add_imitator()
 
     def restore(
         self,
@@ -143,6 +148,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def let_clone_compete(self) -> None:
         """Let the policy choose between actor and clone (`ibrl`) if there is a clone."""
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
+        self.policy.residual = self.hyperparameters.residual and self.progress.cloned
 
     def operations(self) -> AbstractContextManager[None]:
         """Return the context that the networks compute in, by the keyword `fast`."""

@@ -11,6 +11,7 @@ Example::
 import os
 import warnings
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -263,6 +264,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
+        if settings.residual and progress.cloned and not head_start:
+            self.begin_residual()
         self.learner.step = progress.num_timesteps
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
@@ -272,6 +275,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.policy.average(self.averaging())
         progress.updates += 1
         progress.task_updates += 1
+
+    def begin_residual(self) -> None:
+        """Keep the actor as it is now as the imitator, from which its corrections are measured."""
+        policy = self.policy
+        if policy.imitator is None:
+            policy.imitator = deepcopy(policy.actor)
+            self.learner.add_imitator()
 
     def averaging(self) -> float:
         """Return by how much the average actor moves now: it begins after the head start."""

@@ -10,8 +10,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from wpt_agents.model.actor_critic import Critic
+from wpt_agents.model.actor_critic import Actor, Critic
 from wpt_agents.model.behavior_cloning import PriorActor
+from wpt_agents.model.distributions import TruncatedNormal
 from wpt_agents.model.rssm import RSSM, Latent
 from wpt_agents.model.world_model import WorldModel
 
@@ -22,6 +23,7 @@ class Chooser(Protocol):
     world_model: WorldModel
     target_critic: Critic
     prior_actor: PriorActor
+    imitator: Actor | None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
 
 
@@ -64,3 +66,23 @@ def actor_or_clone(policy: Chooser, state: Latent, action: Tensor, frames: Tenso
     rssm = policy.world_model.rssm
     values = (value_of_action(rssm, policy.target_critic, state, a) for a in (action, proposal))
     return choose_by_value(action, proposal, *values)
+
+
+def corrected(
+    policy: Chooser, dist: TruncatedNormal, state: Latent, frames: Tensor
+) -> TruncatedNormal:
+    """Return the actor's distribution around the clone's action instead of its imitation of it.
+
+    The mean is that of the clone plus what imagination has changed: the difference between the
+    actor and an actor that only imitates the clone. Without any difference the clone acts, and not
+    an imitation of it from latent states, which lack what the world model does not reconstruct.
+
+    :param dist: the actor's, (N, A)
+    :param state: (N, ...), where to act
+    :param frames: (N, F, 64, 64, 3) uint8, what the clone sees
+    """
+    assert policy.imitator is not None
+    clone = policy.prior_actor.act(frames, policy.action_mask)
+    imitation = policy.imitator.dist(state.feat, policy.action_mask).mean
+    mean = (clone + dist.mean - imitation).clamp(-1, 1)
+    return TruncatedNormal(mean, dist.std, policy.action_mask)

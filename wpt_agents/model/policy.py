@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.choosing import actor_or_clone
+from wpt_agents.model.choosing import actor_or_clone, corrected
 from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
@@ -54,6 +54,8 @@ class WPTPolicy(PixelPolicy):
 
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
     ibrl: bool = False  # whether the prior actor's action is taken where it is worth more
+    residual: bool = False  # whether the prior actor acts, corrected by what the actor has learned
+    imitator: Actor | None  # the actor without imagination: an imitation of the prior actor alone
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
 
@@ -93,6 +95,7 @@ class WPTPolicy(PixelPolicy):
         self.target_critic = Critic(size, False, self.bin_range).to(device).requires_grad_(False)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.average_actor = None
+        self.imitator = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
         self.return_scale.fill_(0)
         self.updates += 1
@@ -107,6 +110,9 @@ class WPTPolicy(PixelPolicy):
         self.updates += 1
         averaged = any(name.startswith("average_actor.") for name in state_dict)
         self.average_actor = deepcopy(self.actor).requires_grad_(False) if averaged else None
+        imitates = any(name.startswith("imitator.") for name in state_dict)
+        if imitates != (self.imitator is not None):
+            self.imitator = deepcopy(self.actor) if imitates else None
         return super().load_state_dict(state_dict, strict, assign)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -137,10 +143,10 @@ class WPTPolicy(PixelPolicy):
     def initial_state(self, n: int) -> State:
         """Return the acting state of n new episodes: h (n, D), z (n, S, K), last action (n, A).
 
-        With `ibrl`, the last three images (n, F, 64, 64, 3) come before the action.
+        With `ibrl` or `residual`, the last three images (n, F, 64, 64, 3) come before the action.
         """
         shapes = (n, self.size.deter), (n, self.size.stoch, self.size.classes)
-        frames = [np.zeros((n, FRAMES, *IMAGE_SPACE.shape), np.uint8)] if self.ibrl else []
+        frames = [np.zeros((n, FRAMES, *IMAGE_SPACE.shape), np.uint8)] if self.sees_frames else []
         latent = [np.zeros(shape, np.float32) for shape in shapes]
         return (*latent, *frames, np.zeros((n, self.max_action_dim), np.float32))
 
@@ -173,10 +179,13 @@ class WPTPolicy(PixelPolicy):
         # The authors draw the latent even if the action is deterministic.
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.acting_actor.truncated(outputs, self.action_mask)
-        action = dist.mode if deterministic else dist.rsample(generator)
         seen: list[np.ndarray] = []
-        if self.ibrl:
+        if self.sees_frames:
             seen = [stack_frames(image, state[2] if state else None, first)]
+        if self.residual and self.imitator is not None:
+            dist = corrected(self, dist, post, self._tensor(seen[0]))
+        action = dist.mode if deterministic else dist.rsample(generator)
+        if self.ibrl:
             action = actor_or_clone(self, post, action, self._tensor(seen[0]))
         latent = [x.cpu().numpy() for x in post]
         state = (*latent, *seen, action.cpu().numpy())
@@ -187,9 +196,14 @@ class WPTPolicy(PixelPolicy):
     def _with_frames(self, state: State, image: np.ndarray) -> State:
         """Add or remove the images of a state, so that `ibrl` can change within an episode."""
         parts = len(state) if isinstance(state, tuple | list) else 0
-        if self.ibrl and parts == 3:
+        if self.sees_frames and parts == 3:
             return (*state[:2], stack_frames(image, None, None), state[2])
-        return (*state[:2], state[3]) if parts == 4 and not self.ibrl else state
+        return (*state[:2], state[3]) if parts == 4 and not self.sees_frames else state
+
+    @property
+    def sees_frames(self) -> bool:
+        """Whether the prior actor takes part in acting."""
+        return self.ibrl or self.residual
 
     def executed(self, state: State, action: np.ndarray) -> State:
         """Return the acting state after `action` (n, A) was executed instead of the policy's."""

@@ -270,6 +270,13 @@ class Hyperparameters(Keywords):
         "paper",
         Stage.ACTING,
     )
+    residual: bool = switch(
+        False,
+        "act by the prior actor's action plus the difference between the actor and an actor that "
+        "only imitates the prior actor: before anything is learned in imagination the prior actor "
+        "acts, not an imitation of it from latent states; not in the paper",
+        Stage.ACTING,
+    )
     episode_length: int | None = count(
         None,
         "steps of an episode, for the guidance window; that of the longest episode if None",
@@ -356,7 +363,7 @@ class Hyperparameters(Keywords):
     def needs_clone(self) -> bool:
         """Whether the prior actor will ever act or be imitated."""
         guided = ever(parse_schedule(self.value("guidance")))
-        return self.imitates or self.ibrl or guided
+        return self.imitates or self.ibrl or self.residual or guided
 
     def guidance_at(self, step: int) -> float:
         """Return the probability that an episode that begins at this step is guided."""

@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
+from torch.optim import Optimizer
 
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
+    Actor,
     actor_loss,
     actor_weight,
     critic_loss,
@@ -59,6 +61,7 @@ class Learner(WorldModelLearner):
         rate = self.hyperparameters.value("actor_critic_learning_rate")
         self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
         self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
+        self.add_imitator()
         self.step = 0  # collected steps, by which schedules go
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
@@ -71,6 +74,15 @@ class Learner(WorldModelLearner):
         rate = share * self.hyperparameters.value("actor_critic_learning_rate")
         self.set_rate(self.actor_optimizer, rate)
         self.set_rate(self.critic_optimizer, rate)
+        if self.imitator_optimizer is not None:
+            self.set_rate(self.imitator_optimizer, rate)
+
+    def add_imitator(self) -> None:
+        """Make an optimiser of the policy's imitator, if it has one."""
+        self.imitator_optimizer: Optimizer | None = None
+        if imitator := self.policy.imitator:
+            rate = self.hyperparameters.value("actor_critic_learning_rate")
+            self.imitator_optimizer = self.adam([list(imitator.parameters())], rate)
 
     def update(
         self,
@@ -84,15 +96,19 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        advice = self.advice(batch) if imitation_weight else None
+        imitator = self.policy.imitator
+        advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
         if advice is not None and self.hyperparameters.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
         post, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         imitation = None
-        if advice is not None:
-            loss = self.imitation_loss(post, advice)
+        if advice is not None and imitator is not None and self.imitator_optimizer is not None:
+            loss = self.imitation_loss(imitator, post, advice)
+            self.descend(self.imitator_optimizer, loss, "imitator")
+        if advice is not None and imitation_weight:
+            loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
         starts = self.draw_starts(batch, generator)
@@ -113,20 +129,21 @@ class Learner(WorldModelLearner):
         with self.autocast():
             return policy.prior_actor.act(seen, policy.action_mask)
 
-    def imitation_loss(self, post: Latent, advice: Tensor) -> Tensor:
-        """Kickstarting: how far the actor is from the prior actor on the replayed images.
+    def imitation_loss(self, actor: Actor, post: Latent, advice: Tensor) -> Tensor:
+        """Kickstarting: how far an actor is from the prior actor on the replayed images.
 
         The paper does not have it. Source: https://arxiv.org/abs/1803.03835
         """
         mask = self.policy.action_mask
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
         with self.autocast():
-            return bc_loss(self.policy.actor.dist(feat, mask).mode, advice, mask)
+            return bc_loss(actor.dist(feat, mask).mode, advice, mask)
 
     def states_loss(self, post: Latent, advice: Tensor) -> Tensor:
         """Return the loss by which imitation trains the states, weighted; the actor is fixed."""
-        with frozen(self.policy.actor):
-            return self.hyperparameters.imitation_grad * self.imitation_loss(post, advice)
+        actor = self.policy.actor
+        with frozen(actor):
+            return self.hyperparameters.imitation_grad * self.imitation_loss(actor, post, advice)
 
     def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
         """DreamerV3's replay value loss, on the rows whose rewards are known.

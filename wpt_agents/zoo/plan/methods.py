@@ -120,7 +120,7 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
     }
 
 
-NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False}
+NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
 ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data beside the replay
 # DreamerV3 from scratch, by the settings of its code for images of DMControl. Left out are its
 # optimiser, norms and pooling, the spacing of its bins, and the critic's regulariser on replayed

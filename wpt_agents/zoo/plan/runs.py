@@ -122,7 +122,7 @@ class Run:
         wpt = SimpleNamespace(**self.full_keywords)
         guided = ever(parse_schedule(wpt.guidance))
         imitates = ever(parse_schedule(wpt.kickstart, np.inf))
-        return bool(wpt.offline_ratio) or guided or imitates or wpt.ibrl
+        return bool(wpt.offline_ratio) or guided or imitates or wpt.ibrl or wpt.residual
 
     @property
     def updates(self) -> int | None:

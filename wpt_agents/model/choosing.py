@@ -1,4 +1,4 @@
-"""Which of two actions to take: the actor's or the clone's, by the value of where they lead.
+"""How actor and clone act together: by the value of where their actions lead, or by their sum.
 
 The choice is that of imitation-bootstrapped RL (IBRL, https://arxiv.org/abs/2311.02198). IBRL asks
 a Q-function; here the world model imagines the step. Values include the reward on arriving (Eq. 2),
@@ -73,16 +73,17 @@ def corrected(
 ) -> TruncatedNormal:
     """Return the actor's distribution around the clone's action instead of its imitation of it.
 
-    The mean is that of the clone plus what imagination has changed: the difference between the
-    actor and an actor that only imitates the clone. Without any difference the clone acts, and not
-    an imitation of it from latent states, which lack what the world model does not reconstruct.
+    The mean is the clone's action plus what imagination has changed: the difference between the
+    actor and an actor that only imitates the clone. Where they agree, and before imagination, the
+    clone acts, and not an imitation of it from latent states, which lack details of the images.
+    Corrections of a given policy: https://arxiv.org/abs/1812.03201
 
     :param dist: the actor's, (N, A)
     :param state: (N, ...), where to act
     :param frames: (N, F, 64, 64, 3) uint8, what the clone sees
     """
-    assert policy.imitator is not None
-    clone = policy.prior_actor.act(frames, policy.action_mask)
-    imitation = policy.imitator.dist(state.feat, policy.action_mask).mean
-    mean = (clone + dist.mean - imitation).clamp(-1, 1)
-    return TruncatedNormal(mean, dist.std, policy.action_mask)
+    mask = policy.action_mask
+    clone = policy.prior_actor.act(frames, mask)
+    imitator = policy.imitator
+    imitation = dist.mean if imitator is None else imitator.dist(state.feat, mask).mean
+    return TruncatedNormal((clone + (dist.mean - imitation)).clamp(-1, 1), dist.std, mask)

@@ -182,7 +182,7 @@ class WPTPolicy(PixelPolicy):
         seen: list[np.ndarray] = []
         if self.sees_frames:
             seen = [stack_frames(image, state[2] if state else None, first)]
-        if self.residual and self.imitator is not None:
+        if self.residual:
             dist = corrected(self, dist, post, self._tensor(seen[0]))
         action = dist.mode if deterministic else dist.rsample(generator)
         if self.ibrl:

@@ -1,0 +1,112 @@
+"""Acting by the clone's action, corrected by what imagination has changed (`residual`)."""
+
+from collections import defaultdict
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from debug_agent import agent, noise, pretrained, recorded, same, weights
+from toy_env import LENGTH, DotEnv
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.model.choosing import corrected
+from wpt_agents.model.distributions import TruncatedNormal
+from wpt_agents.model.observations import stack_frames
+from wpt_agents.model.prior_policy import prior_action
+from wpt_agents.model.rssm import Latent
+
+
+@pytest.fixture(scope="module")
+def data():
+    return TrajectoryDataset.of([recorded(seed=seed, length=12) for seed in range(6)])
+
+
+def learned(data, **changes):
+    settings = {"residual": True, "kickstart": 1.0, "actor_delay": 3, "warmup_steps": 0}
+    settings |= {"guidance": 0.0, "train_ratio": 2}
+    return pretrained(data, env=DotEnv(), **settings | changes).learn(LENGTH)
+
+
+def test_the_mean_is_the_clones_plus_what_the_actor_has_learned():
+    mask = torch.tensor([True, True, False])
+
+    def normal(mean, std):
+        return TruncatedNormal(torch.tensor([mean]), torch.tensor([std]), mask)
+
+    policy = SimpleNamespace(
+        prior_actor=SimpleNamespace(act=lambda frames, _: torch.tensor([[0.5, 0.9, 0.0]])),
+        imitator=SimpleNamespace(dist=lambda feat, _: normal([0.25, 0.5, 0.0], [1.0, 1.0, 1.0])),
+        action_mask=mask,
+    )
+    actor = normal([0.5, 1.0, 0.0], [0.25, 0.5, 0.1])
+    state = Latent(torch.zeros(1, 4), torch.zeros(1, 2, 2))
+    dist = corrected(policy, actor, state, torch.zeros(1))
+    assert dist.mean.tolist() == [[0.75, 1.0, 0.0]]  # 0.5 + (0.5 - 0.25); 0.9 + 0.5 is clipped
+    assert torch.equal(dist.std, actor.std)
+
+
+def test_without_imagination_the_clone_acts(data):
+    policy = learned(data).policy
+    policy.actor.load_state_dict(policy.imitator.state_dict())
+    state = frames = None
+    for image in noise(3, 2):
+        action, state = policy.act(image, state, None, deterministic=True)
+        frames = stack_frames(image, frames, None)
+        np.testing.assert_allclose(action, prior_action(policy, frames), atol=1e-6)
+        np.testing.assert_array_equal(state[-1], action)
+
+
+def test_the_imitator_is_the_actor_at_the_end_of_the_head_start(data):
+    model = learned(data, train_ratio=1e-9)  # the head start's updates alone
+    assert model.progress.updates == 3 and model.policy.imitator is None
+    model.begin_residual()
+    both = zip(model.policy.actor.parameters(), model.policy.imitator.parameters(), strict=True)
+    assert all(torch.equal(actor, imitator) for actor, imitator in both)
+
+
+def test_the_imitator_learns_beside_the_others_and_changes_none_of_them(data, tmp_path):
+    model = learned(data, train_ratio=1e-9)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "replay")
+    after = []
+    for residual in (False, True):
+        one = WPT.load(tmp_path / "model", env=DotEnv(), dataset=data, residual=residual)
+        one.load_replay_buffer(tmp_path / "replay")
+        one.retrieve()
+        one.update(defaultdict(list))
+        after.append(weights(one))
+    plain, corrected = after
+    imitator = {k: w for k, w in corrected.items() if k.startswith("imitator.")}
+    assert imitator and same(plain, {k: w for k, w in corrected.items() if k not in imitator})
+    before = weights(model, "actor.")
+    assert not any(torch.equal(imitator[f"imitator.{k[6:]}"], w) for k, w in before.items())
+
+
+def test_without_a_clone_the_actor_acts(data):
+    model = agent(DotEnv(), residual=True, offline_ratio=0, guidance=0)
+    assert not model.policy.residual and model.hyperparameters.needs_clone
+    model = learned(data)
+    assert model.policy.residual and model.policy.imitator is not None
+    model.reset_task()
+    assert not model.policy.residual and model.policy.imitator is None
+
+
+def test_an_interrupted_run_goes_on_exactly(data, tmp_path):
+    model = learned(data)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "replay")
+    loaded = WPT.load(tmp_path / "model", env=DotEnv(), dataset=data)
+    loaded.load_replay_buffer(tmp_path / "replay")
+    assert loaded.policy.residual
+    for one in (model, loaded):
+        one.env.seed(7)
+        one._last_obs = None
+        one.learn(2 * LENGTH, reset_num_timesteps=False)
+        one.update(defaultdict(list))
+    assert same(weights(model), weights(loaded))
+    for ours, theirs in zip(
+        model.replay_buffer.trajectories, loaded.replay_buffer.trajectories, strict=True
+    ):
+        np.testing.assert_array_equal(ours.action, theirs.action)

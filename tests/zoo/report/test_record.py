@@ -177,8 +177,10 @@ def test_the_pages_rows_are_those_of_the_records_tables():
     for row in scores:
         method, *cells = [cell.strip() for cell in row.strip("|").split("|")]
         for suite, cell in zip(("dmc", "metaworld", "both"), cells, strict=True):
-            own = [x for x in table if re.match(rf"\| {suite} \| {method} \| \d+ \| \d+ \|", x)]
-            assert not cell or own[0].endswith(f"| {cell} |")
+            matching = [
+                x for x in table if re.match(rf"\| {suite} \| {method} \| \d+ \| \d+ \|", x)
+            ]
+            assert not cell or matching[0].endswith(f"| {cell} |")
 
 
 def test_methods_are_told_from_doing_nothing_to_ours():

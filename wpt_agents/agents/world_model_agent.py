@@ -32,7 +32,7 @@ from wpt_agents.training.checks import check_dataset, check_trajectory
 from wpt_agents.training.environments import time_limit
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner
-from wpt_agents.training.model_files import write_world_model
+from wpt_agents.training.model_files import WORLD_MODEL, write_world_model
 from wpt_agents.training.progress import WorldModelProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.spaces import check_spaces
@@ -132,7 +132,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         tensors: Mapping[str, Mapping[str, Tensor]],
         same: tuple[str, ...],
     ) -> None:
-        """Take over a model file. Heads that have learned need the bins that they learned with."""
+        """Take over a model file. Heads that have learned need the bins that they learned with.
+
+        Of a file that holds a world model alone, the counters of the task begin again, too.
+        """
+        if WORLD_MODEL in tensors:
+            before = self.progress_class.of(header["counters"])
+            kept = {name: getattr(before, name) for name in ("pretrain_steps", "initialised")}
+            header = {**header, "counters": self.progress_class(**kept).as_dict()}
         if header["counters"].get("updates"):
             same = (*same, "bin_range")
             keywords = {"bin_range": BIN_RANGE} | header["hyperparameters"]  # not in older files

@@ -342,6 +342,12 @@ class Hyperparameters(Keywords):
                 f"kickstart looks at {FRAMES} images in a row, but batch_length="
                 f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
             )
+        if self.actor_delay and self.needs_clone and self.batch_length < FRAMES:
+            raise ValueError(
+                f"actor_delay imitates the prior actor, which looks at {FRAMES} images in a row, "
+                f"but batch_length={self.batch_length}: use batch_length={FRAMES} or more, or "
+                "actor_delay=0"
+            )
 
     @property
     def marks(self) -> bool:

@@ -50,10 +50,12 @@ class WPTPolicy(PixelPolicy):
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
     :param bin_range: largest value of reward head and critic, in symlog space
+    :param reward_ensemble: number of reward heads
+    :param continue_head: predict where episodes end
+    :param ibrl: take the prior actor's action where it is worth more than the actor's
     """
 
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
-    ibrl: bool = False  # whether the prior actor's action is taken where it is worth more
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
 
@@ -67,9 +69,13 @@ class WPTPolicy(PixelPolicy):
         zero_init_heads: bool = False,
         actor_outscale: float = 1.0,
         bin_range: float = BIN_RANGE,
+        reward_ensemble: int = 1,
+        continue_head: bool = False,
+        ibrl: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.updates = 0
+        self.ibrl = ibrl
         self.size = size
         self.max_action_dim = max_action_dim
         self.unimix = unimix
@@ -80,6 +86,9 @@ class WPTPolicy(PixelPolicy):
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
+        self.world_model.make_reward_members(range(reward_ensemble - 1))
+        if continue_head:
+            self.world_model.make_continue_head(0.0, 0)
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
@@ -247,8 +256,12 @@ class WPTPolicy(PixelPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ["observation_space", "action_space", "size", "max_action_dim", "unimix"]
-        names += ["zero_init_heads", "actor_outscale", "bin_range"]
-        return {name: getattr(self, name) for name in names}
+        names += ["zero_init_heads", "actor_outscale", "bin_range", "ibrl"]
+        heads = {
+            "reward_ensemble": 1 + len(self.world_model.reward_members),
+            "continue_head": self.world_model.continue_head is not None,
+        }
+        return {name: getattr(self, name) for name in names} | heads
 
 
 @op

@@ -19,6 +19,7 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files import archive, model_file
 from wpt_agents.files.model_file import read_model, write_model
 from wpt_agents.model.sizes import SIZES
+from wpt_agents.training.progress import WPTProgress
 
 
 @pytest.fixture
@@ -332,6 +333,17 @@ def test_a_shared_world_model_is_the_model_rounded_and_can_be_fine_tuned(store, 
             assert torch.equal(tensor, kept[name].bfloat16().float()), name
     loaded.learn(60)
     assert loaded.updates > 0
+
+
+def test_a_shared_world_model_begins_a_task_from_its_start(learnt, store, tmp_path):
+    assert learnt.progress.cloned and learnt.updates > 0
+    learnt.save_world_model(tmp_path / "shared.zip")
+    loaded = WPT.load(tmp_path / "shared.zip", env=ClockEnv(), dataset=store, bin_range=7.0)
+    assert loaded.progress == WPTProgress(pretrain_steps=2, initialised=True)
+    assert loaded.prior is None  # and not the initial weights of one
+    before = weights(loaded, "prior_actor")
+    loaded.learn(7)
+    assert loaded.progress.cloned and not same(weights(loaded, "prior_actor"), before)
 
 
 def test_a_shipped_model_is_found_by_its_name(store, tmp_path, monkeypatch):

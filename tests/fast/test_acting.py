@@ -205,6 +205,21 @@ def test_a_policy_is_saved_and_loaded_alone(learnt, tmp_path):
     assert_defined(loaded)
 
 
+def test_a_policy_is_loaded_with_the_heads_that_only_some_have_and_with_ibrl(learnt, tmp_path):
+    model = copy.deepcopy(learnt)
+    model.world_model.make_continue_head(1.0, 0)
+    model.world_model.make_reward_members([0, 1])
+    model.average(0.5)
+    model.ibrl = True
+    model.save(tmp_path / "policy.pth")
+    loaded = WPTPolicy.load(tmp_path / "policy.pth", device="cpu")
+    feat = torch.randn(5, learnt.size.deter + learnt.size.stoch * learnt.size.classes)
+    assert torch.equal(loaded.world_model.rewards(feat), model.world_model.rewards(feat))
+    assert torch.equal(loaded.world_model.goes_on(feat), model.world_model.goes_on(feat))
+    assert loaded.average_actor is not None and loaded.ibrl
+    np.testing.assert_array_equal(action(loaded), action(model))
+
+
 def test_a_policy_that_is_no_longer_used_is_forgotten():
     policy = agent().policy
     acted(policy, 1)

@@ -11,6 +11,7 @@ from wpt_envs import TASKS
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds
+from wpt_agents.zoo.run.checkpoints import HEAD_START_MODEL, HeadStart
 from wpt_agents.zoo.run.logs import Evaluations
 from wpt_agents.zoo.tasks import metric_of
 
@@ -74,3 +75,15 @@ def test_without_a_file_to_keep_none_is_written(tmp_path, played):
 def test_each_suite_has_its_rule():
     rules = {task.suite: metric_of(task) for task in TASKS.values()}
     assert rules["dmc"] == "return" and rules["metaworld"] == "success"
+
+
+def test_a_later_task_saves_the_end_of_its_own_head_start(tmp_path):
+    model = agent(ClockEnv(length=7), learning_starts=7, train_ratio=4, actor_delay=5)
+    model.learn(14, callback=HeadStart(tmp_path / "first"))
+    saved = [(tmp_path / "first" / HEAD_START_MODEL).exists()]
+    model.next_task(ClockEnv(length=7))
+    model.learning_starts = 14
+    for steps in (14, 7):  # the updates are made after step 14
+        model.learn(steps, callback=HeadStart(tmp_path / "second"), reset_num_timesteps=False)
+        saved.append((tmp_path / "second" / HEAD_START_MODEL).exists())
+    assert saved == [True, False, True]

@@ -49,9 +49,9 @@ Metrics = dict[str, list[Tensor]]
 
 
 class PixelAgent(SavedAgent):
-    """An algorithm that acts on images, learns from stored episodes and keeps SB3's verbs."""
+    """The base of agents that act on images and learn from stored episodes, with SB3's methods."""
 
-    warmup_pays: ClassVar[bool] = False  # whether steps before `learning_starts` pay for updates
+    warmup_pays: ClassVar[bool] = False  # whether steps before `learning_starts` earn updates
 
     # What a subclass must provide, besides `make_policy` and `make_learner`
 
@@ -62,7 +62,7 @@ class PixelAgent(SavedAgent):
     @property
     @abstractmethod
     def updates_per_step(self) -> float:
-        """How many updates a collected step pays for."""
+        """How many updates are made for each collected step."""
 
     # Hooks
 
@@ -74,7 +74,7 @@ class PixelAgent(SavedAgent):
 
     @property
     def warmup_driver(self) -> str:
-        """Who drives the warm-up, in words."""
+        """What chooses the actions in the warm-up, in words."""
         return "random actions"
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
@@ -89,14 +89,14 @@ class PixelAgent(SavedAgent):
         return np.asarray(actions, np.float32)
 
     def on_episode(self, trajectory: Trajectory) -> None:
-        """Look at a finished episode before it is added to the replay buffer."""
+        """Handle a finished episode before it is added to the replay buffer."""
 
     def steps_per_update(self) -> float:
-        """Return how many collected steps pay for the first update."""
+        """Return how many collected steps the first update needs."""
         return 1 / self.updates_per_step
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return the assignment by which `steps` collected steps pay for an update, "" for none."""
+        """Return an assignment with which `steps` steps are enough for an update, "" for none."""
         return ""
 
     # Learning
@@ -112,7 +112,7 @@ class PixelAgent(SavedAgent):
     ) -> Self:
         """Collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, a lower bound
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :return: the agent itself
@@ -134,7 +134,7 @@ class PixelAgent(SavedAgent):
         tb_log_name: str,
         progress_bar: bool,
     ) -> Iterator[BaseCallback]:
-        """Set up what `learn` needs and reset the environment; call the callbacks at both ends."""
+        """Set up what `learn` needs, reset the environment, call the first and last callback."""
         if self.env is None:
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
         total_timesteps, callback = self._setup_learn(
@@ -167,7 +167,7 @@ class PixelAgent(SavedAgent):
     def collect(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Step all environments until an episode ends, or has become so long that it is stored.
 
-        :return: False when a callback says stop
+        :return: False if a callback asked to stop
         """
         assert self.env is not None
         rollout = self._open_rollout()
@@ -250,7 +250,7 @@ class PixelAgent(SavedAgent):
         self.progress.cut += cut
 
     def updates_due(self) -> int:
-        """Return how many updates the collected steps have paid for."""
+        """Return how many updates are due for the collected steps."""
         return int(self.credit * self.updates_per_step + 1e-9)  # rounding must not cost one
 
     def update_models(self) -> None:
@@ -288,9 +288,9 @@ class PixelAgent(SavedAgent):
         self.logger.dump(step=self.num_timesteps)
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Write the collected episodes to one file."""
+        """Write the collected episodes to one file, which `load_replay_buffer` reads."""
         self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Read what `save_replay_buffer` wrote."""
+        """Replace the replay buffer by the episodes in a file of `save_replay_buffer`."""
         self.replay_buffer = ReplayBuffer.load(path)

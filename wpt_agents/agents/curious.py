@@ -101,12 +101,12 @@ class ICMLearner(CuriousLearner):
 class Plan2ExploreLearner(CuriousLearner):
     """The reward of a step is how much an ensemble disagrees on where it leads.
 
-    It is paid on arriving, as the world model's rewards are: in imagination at the states 1 .. H-1,
-    and at the replayed state 0 for the real step that led there, so that the critic's value means
-    the same everywhere. Nothing led to the first state of a replayed sequence, which is paid 0.
+    Rewards belong to the state that a step leads to, as the world model's do: in imagination to the
+    states 1 .. H-1, and at the replayed state 0 to the real step that led there, so that the
+    critic's value means the same everywhere. The first state of a replayed sequence has reward 0.
     """
 
-    arrival: Tensor  # (B*T,), the pay of the replayed states, from some of which dreams start
+    arrival: Tensor  # (B*T,), the rewards of the replayed states, where imagination starts
 
     def update_world_model(
         self,
@@ -133,7 +133,7 @@ class Plan2ExploreLearner(CuriousLearner):
         return post, metrics | {"explore/surprise": surprise[within].mean()}
 
     def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
-        """Return the disagreement of the ensemble in a dream, (N, H)."""
+        """Return the disagreement of the ensemble on imagined steps, (N, H)."""
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         feat = dream.states.feat
@@ -156,7 +156,7 @@ class Explorer(WPT):
         return policy
 
     def make_curiosity(self, policy: WPTPolicy) -> nn.Module:
-        """Make the network that finds out what is new."""
+        """Make the network that measures surprise."""
         raise NotImplementedError
 
     def make_learner(self) -> CuriousLearner:
@@ -200,7 +200,7 @@ class Explorer(WPT):
 
 
 class ICMExplorer(Explorer):
-    """Explores where an intrinsic curiosity module is surprised."""
+    """Collect data by seeking states that surprise an intrinsic curiosity module (ICM)."""
 
     saved_as = "ICMExplorer"
     learner_class = ICMLearner
@@ -211,7 +211,7 @@ class ICMExplorer(Explorer):
 
 
 class Plan2Explore(Explorer):
-    """Explores where an ensemble of one-step models disagrees."""
+    """Collect data by seeking states in which an ensemble of one-step models disagrees."""
 
     saved_as = "Plan2Explore"
     learner_class = Plan2ExploreLearner

@@ -135,7 +135,7 @@ class DrQv2Keywords(FrameKeywords):
         np.inf,
         "standard deviation of the noise on actions, a number or a schedule over steps. The "
         "published ones last 100,000 steps on easy tasks, 500,000 on medium and 2,000,000 on hard "
-        "ones; shorten it for short runs, or the noise never lets the policy act",
+        "ones; shorten it for short runs, or noise dominates the actions to the end",
     )
     std_clip: float = amount(0.3, "largest noise in targets and in the actor's loss")
     pre_activation: float = amount(
@@ -242,8 +242,8 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
         model = DrQv2("CnnPolicy", "wpt/dmc-cartpole-balance-v0", std="linear(1,0.1,50000)")
         model.learn(50_000).save("cartpole.zip")
 
-    It differs from the published code in two things: images have 64 pixels instead of 84, and all
-    starts of n-step transitions are equally likely where episodes differ in length.
+    It differs from the published code in two things: images are 64 x 64 pixels instead of 84 x 84,
+    and all starts of n-step transitions are equally likely where episodes differ in length.
 
     :param policy: "CnnPolicy"
     """

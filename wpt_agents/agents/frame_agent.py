@@ -98,7 +98,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     @property
     def updates_per_step(self) -> float:
-        """How many updates a collected step pays for."""
+        """How many updates are made for each collected step."""
         return 1 / self.hyperparameters.update_every
 
     @property
@@ -112,7 +112,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return False
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return the assignment by which `steps` collected steps pay for an update."""
+        """Return an assignment with which `steps` collected steps are enough for an update."""
         return f"model.update_every = {max(steps, 1)}"
 
     def check_data(self, dataset: TrajectoryDataset) -> None:
@@ -125,7 +125,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             compare_units(self.dataset, self.action_space, self.hyperparameters.embodiment)
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use other offline data: whatever `open_dataset` takes. The next `learn` chooses them."""
+        """Use another dataset; the next call of `learn` chooses the offline data from it."""
         super().set_dataset(dataset)
         if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
             self.retrieved = None
@@ -208,7 +208,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return super().too_late(stage)
 
     def reset_task(self) -> None:
-        """Forget the task: episodes, offline data, the clone, and all networks."""
+        """Discard the episodes and the offline data, and initialise all networks again."""
         self.retrieved = None
         self.progress.reset("retrieved_ids", "retrieved_of", "cloned")
         super().reset_task()

@@ -1,7 +1,7 @@
-"""JSRL-BC (Uchendu et al., 2022): DrQ-v2 whose episodes a behaviour clone begins.
+"""JSRL-BC (Uchendu et al., 2022): DrQ-v2 with a behaviour clone that begins each episode.
 
 Source: https://arxiv.org/abs/2204.02372 with random horizons, as in appendix G of the ICLR 2026
-version of the WPT paper: the clone drives the first h steps of an episode, h in {0, 10, .., 100}.
+version of the WPT paper: the clone acts in the first h steps of an episode, h in {0, 10, .., 100}.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,8 @@ class JSRLKeywords(DrQv2Keywords):
     )
     bc_batch_size: int | None = count(
         None,
-        "images and actions in each; those of `bc_size` if None, 256 for `medium`",
+        "images and actions in an update of the clone; those of `bc_size` if None, 256 for "
+        "`medium`",
         Stage.CLONING,
     )
     bc_learning_rate: float = amount(
@@ -50,7 +51,7 @@ class JSRLKeywords(DrQv2Keywords):
     )
     warmup_steps: int = count(
         0,
-        "first steps, in which the clone acts alone; by default the noise of DrQ-v2 explores",
+        "first steps, in which the clone acts alone; 0, the default, lets DrQ-v2 act and explore",
         Stage.ACTING,
         least=0,
     )

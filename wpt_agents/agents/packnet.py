@@ -206,8 +206,8 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
     def next_task(self, env: Any, progress_bar: bool = False) -> None:
         """Prune and retrain the weights of the present task, then begin another one.
 
-        What was collected is dropped, since another task pays other rewards. The schedules begin
-        again.
+        The collected episodes are discarded, since another task has other rewards. The schedules
+        begin again.
 
         :raises ValueError: the sequence has no further task, or the actions have another width
         """

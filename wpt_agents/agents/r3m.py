@@ -166,9 +166,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         return R3MLearner(self.policy, self.hyperparameters)
 
     def load_weights(self, path: str | os.PathLike[str]) -> None:
-        """Take the network of a file that R3M's authors publish.
+        """Load the encoder's weights from a file that R3M's authors publish, such as `r3m_18.pt`.
 
-        :raises ValueError: another layout, or another depth than `backbone` has
+        :raises ValueError: the file has another layout, or another depth than `backbone`
         """
         body, weights = self.policy.encoder.body, read_r3m(os.fspath(path))
         if not isinstance(body, ResNet) or body.state_dict().keys() != weights.keys():
@@ -217,14 +217,14 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
     ) -> Self:
         """Train the encoder on reward-free trajectories of any robots.
 
-        :param dataset: whatever `open_dataset` takes
+        :param dataset: what the keyword `dataset` takes
         :param env: the environment to continue with, if known
-        :param steps: updates
+        :param steps: number of updates
         :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
             on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
             If a model is there, training continues from it
         :param callback: called after every update with (step, metrics)
-        :param accumulate: must be 1; `WPT.pretrain` has it, too
+        :param accumulate: must be 1; accepted because `WPT.pretrain` has it
         :param kwargs: keywords of `R3M`
         """
         if accumulate != 1:

@@ -90,7 +90,8 @@ class RLPDKeywords(FrameKeywords):
         "true",
         LABELS,
         "the rewards of offline data: 'true', those of the dataset; 'zero' (UDS); or "
-        "'optimistic' (ExPLORe), the mean of a reward ensemble and `beta` times its deviation",
+        "'optimistic' (ExPLORe), the mean of a reward ensemble plus `beta` times its standard "
+        "deviation",
         Stage.SIZE,
     )
     reward_members: int = count(5, "reward heads of the label 'optimistic'", Stage.SIZE)

@@ -1,4 +1,4 @@
-"""What every agent keeps: keywords, random numbers, environment, model files and copies."""
+"""The base of all agents: keywords, random numbers, environment, model files and copies."""
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
@@ -34,7 +34,8 @@ class SavedAgent(KeywordAgent):
 
     :param policy: the policy's name or class; the first of `policy_aliases` if None
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param dataset: trajectories to learn from: whatever `open_dataset` takes
+    :param dataset: trajectories to learn from: a `TrajectoryDataset`, the path of one or of files
+        in another format, a replay buffer, trajectories, or a list of these
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 for nothing, 1 for information
     :param device: "auto", "cpu", "cuda", ...
@@ -114,7 +115,7 @@ class SavedAgent(KeywordAgent):
         raise ValueError(f"{type(self).__name__} needs an environment: pass env=")
 
     def reset_task(self) -> None:
-        """Forget the task: the episodes, and the networks that `reset_behavior` draws again."""
+        """Discard the episodes, and initialise the networks that belong to the task again."""
         self.replay_buffer = ReplayBuffer()
         self.progress.reset("credit", "seen_length")
         self.rollout = None
@@ -129,7 +130,7 @@ class SavedAgent(KeywordAgent):
     # Data and environments
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use other trajectories from now on: whatever `open_dataset` takes."""
+        """Use another dataset from now on, of any kind that the keyword `dataset` takes."""
         if dataset is not None:
             opened = open_dataset(dataset)
             self.check_data(opened)
@@ -158,9 +159,9 @@ class SavedAgent(KeywordAgent):
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Use another environment, with any number of copies.
 
-        If its actions have another width, what was learned and collected for a task is dropped.
+        If its actions have another width, what was learnt and collected for a task is discarded.
 
-        :raises ValueError: observations that are no images, or actions that are no bounded Box
+        :raises ValueError: observations that are not images, or actions that are not a bounded Box
         """
         self._use_env(self._checked(env), force_reset)
 
@@ -195,11 +196,11 @@ class SavedAgent(KeywordAgent):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """Write the model file: weights, optimisers, keywords and counters; no episodes, no data.
+        """Write the model file: weights, optimisers, keywords and counters, but no episodes.
 
         :param path: the suffix .zip is added where there is none
-        :param exclude: accepted because SB3 has it; nothing optional is in the file
-        :param include: likewise
+        :param exclude: ignored; accepted because SB3 has it
+        :param include: ignored; accepted because SB3 has it
         """
         dataset = None if self.dataset is None else str(self.dataset.path)
         header = self.description() | {"dataset": dataset}
@@ -230,9 +231,9 @@ class SavedAgent(KeywordAgent):
         :param path: the path passed to `save`, or the name of a pre-trained world model that comes
             with the library, such as "metaworld-mid"
         :param env: the environment to continue with
-        :param custom_objects: accepted because SB3 has it
+        :param custom_objects: ignored; accepted because SB3 has it
         :param print_system_info: print this system's versions, as SB3 does
-        :param kwargs: keywords of the constructor that are to change, also `dataset`
+        :param kwargs: new values for keywords of the constructor, also `dataset`
         :raises ValueError: a file that is cut short, damaged or another agent's; unknown keywords
         :raises FileNotFoundError: no such file; for a folder, the message lists the files in it
         """

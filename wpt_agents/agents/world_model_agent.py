@@ -33,7 +33,7 @@ from wpt_agents.training.checks import check_dataset, check_trajectory
 from wpt_agents.training.environments import time_limit
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner
-from wpt_agents.training.model_files import write_world_model
+from wpt_agents.training.model_files import WORLD_MODEL, write_world_model
 from wpt_agents.training.progress import WorldModelProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.spaces import check_spaces
@@ -42,7 +42,7 @@ INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior i
 
 
 class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelProgress):
-    """An agent with a world model, an actor, a critic and a prior actor.
+    """The base of agents with a world model, an actor, a critic and a prior actor.
 
     `WPT` adds what they learn and when.
     """
@@ -137,7 +137,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         tensors: Mapping[str, Mapping[str, Tensor]],
         same: tuple[str, ...],
     ) -> None:
-        """Take over a model file. Heads that have learned need the bins that they learned with."""
+        """Take over a model file. Heads that have learned need the bins that they learned with.
+
+        Of a file that holds a world model alone, the counters of the task begin again, too.
+        """
+        if WORLD_MODEL in tensors:
+            before = self.progress_class.of(header["counters"])
+            kept = {name: getattr(before, name) for name in ("pretrain_steps", "initialised")}
+            header = {**header, "counters": self.progress_class(**kept).as_dict()}
         if header["counters"].get("updates"):
             same = (*same, "bin_range")
             keywords = {"bin_range": BIN_RANGE} | header["hyperparameters"]  # not in older files
@@ -146,7 +153,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         self.let_clone_compete()
 
     def let_clone_compete(self) -> None:
-        """Let the policy choose between actor and clone (`ibrl`) if there is a clone."""
+        """Let the clone take part in acting (`ibrl`, `residual`) if there is one."""
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
         self.policy.residual = self.hyperparameters.residual and self.progress.cloned
 
@@ -158,12 +165,12 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
 
     @property
     def updates_per_step(self) -> float:
-        """How many updates a collected step pays for; an update replays B x T steps."""
+        """How many updates are made for each collected step; an update replays B x T steps."""
         settings = self.hyperparameters
         return settings.train_ratio / (settings.batch_size * settings.batch_length)
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return the assignment by which `steps` collected steps pay for an update."""
+        """Return an assignment with which `steps` collected steps are enough for an update."""
         settings = self.hyperparameters
         ratio = math.ceil(settings.batch_size * settings.batch_length / max(steps, 1))
         return f"model.train_ratio = {ratio}"
@@ -210,9 +217,9 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         return self.progress.episodes + self.progress.cut > 0
 
     def reset_task(self) -> None:
-        """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.
+        """Keep the world model and discard everything else, for another task.
 
-        The optimisers, also that of the world model, start with new averages.
+        The optimisers, also that of the world model, start again with zero averages.
         """
         self.progress.reset("cloned", "task_updates")
         super().reset_task()
@@ -234,13 +241,19 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
-        """Return actions for observations and the state for the next call; see `WPTPolicy`."""
+        """Return actions for observations, and the recurrent state for the next call, as in SB3.
+
+        :param observation: images (64, 64, 3) or (n, 64, 64, 3), or a Dict with one image
+        :param state: the state that the last call returned; None at the start of an episode
+        :param episode_start: (n,) bool, the environments whose episode has just begun
+        :param deterministic: act by the most likely latent state and the mean action
+        """
         with self.operations():
             return self.policy.predict(observation, state, episode_start, deterministic)
 
     @property
     def prior(self) -> PriorPolicy | None:
-        """The prior actor, with `predict`; None before it is cloned."""
+        """The prior actor as a policy with `predict`, or None before it is trained."""
         return PriorPolicy(self.policy) if self.progress.cloned else None
 
     def build_index(self, progress_bar: bool = False) -> Retriever:
@@ -252,7 +265,11 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
 
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """Predict a trajectory's images, (T, 64, 64, 3) uint8, from the first `context` of them.
+        """Predict a trajectory's images, (T, 64, 64, 3) uint8, from its first images and actions.
+
+        :param trajectory: images to start from and actions to follow
+        :param context: number of images that the model sees; these are reconstructed
+        :param horizon: number of images to predict after them, at most
 
         :raises ValueError: no context, more actions than the model takes, images of another size
         """
@@ -274,7 +291,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """Read a model file of the paper's authors, such as `dmcontrol.pt`.
 
         The widths and `max_action_dim` are inferred from the shapes. Reward head, actor, critic and
-        target critic are read if the file has them, and drawn if it has not.
+        target critic are read if the file has them; otherwise they are initialised.
 
         :param path: a `torch.save` file of nested state dicts; it is read with `weights_only=True`
         :param env: the environment to continue with

@@ -1,4 +1,4 @@
-"""Algorithm 1: pre-train on reward-free data, then retrieve, clone, collect and update.
+"""WPT, Algorithm 1: pre-train on reward-free data, then retrieve, clone, collect and update.
 
 Example::
 
@@ -46,7 +46,7 @@ NO_DATASET = (
 
 
 class WPT(WorldModelAgent, progress=WPTProgress):
-    """Generalist world-model pre-training and fine-tuning, with Stable-Baselines3's verbs.
+    """Generalist world-model pre-training and fine-tuning, with the methods of Stable-Baselines3.
 
     Example::
 
@@ -59,7 +59,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     :param policy: "WPTPolicy"
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param dataset: D_off, for rehearsal and guidance: whatever `open_dataset` takes
+    :param dataset: D_off, for rehearsal and guidance: a `TrajectoryDataset`, the path of one or of
+        files in another format, a replay buffer, trajectories, or a list of these
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 for nothing, 1 for information
     :param device: "auto", "cpu", "cuda", ...
@@ -87,19 +88,19 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         accumulate: int = 1,
         **kwargs: Any,
     ) -> Self:
-        """Train a world model on reward-free trajectories of any embodiments, by Eq. (1).
+        """Train a world model on reward-free trajectories of one or several robots, by Eq. (1).
 
-        Started by `torchrun`, the processes divide each batch among them, learn what one process
-        would learn from it, and all return the model; rank 0 alone writes files, calls the callback
-        and shows the progress bar.
+        With `torchrun`, the processes divide each batch among them, learn what one process would
+        learn from it, and all return the model; rank 0 alone writes files, calls the callback and
+        shows the progress bar.
 
-        :param dataset: a TrajectoryDataset or its path, other people's files, trajectories:
-            whatever `open_dataset` takes
+        :param dataset: what the keyword `dataset` of `WPT` takes
         :param env: the environment to continue with, if known
-        :param steps: updates in all; those of the size if None, 200,000 for `paper`
-        :param run_dir: folder of `model.zip`, which is written every 1000 steps, at the end, and on
-            Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events. If
-            a model is there, training continues from it, on any number of processes
+        :param steps: number of updates in total; if None, it depends on the size (200,000 for
+            `paper`)
+        :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
+            on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
+            If a model is there, training continues from it, on any number of processes
         :param callback: called after every update with (step, metrics)
         :param accumulate: passes over a batch, or a process's share of it, to save memory
         :param kwargs: keywords of `WPT`, also `tensorboard_log`; `batch_size` is that of all
@@ -138,9 +139,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Run Algorithm 1 from its second heading on: retrieve, clone, then collect and update.
+        """Fine-tune on the task (Algorithm 1): retrieve, clone, then collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, a lower bound
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
         :param callback: SB3's callbacks
         :param log_interval: episodes between two dumps of the log
         :return: the model itself
@@ -158,7 +159,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return self
 
     def retrieve(self, progress_bar: bool = False) -> None:
-        """// Experience Retrieval: the R trajectories that begin most like the task, Eq. (5)."""
+        """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
         settings = self.hyperparameters
         progress = self.progress
         used = settings.needs_clone or settings.offline_ratio
@@ -188,7 +189,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.retrieved = retrieved
 
     def clone(self, progress_bar: bool = False) -> None:
-        """// Behavior Cloning Policy Training, on the retrieved trajectories."""
+        """Train the prior actor on the retrieved trajectories, once for a task."""
         settings = self.hyperparameters
         if self.retrieved is None or self.progress.cloned or not settings.needs_clone:
             return
@@ -213,13 +214,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     # // Collect Data: see `PixelAgent.collect`, which asks these
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
-        """Return the steps of a new episode that the prior actor drives."""
+        """Return the steps of a new episode at which the prior actor acts."""
         guided = self.hyperparameters.guidance_at(self.num_timesteps)
         return draw_window(guided if self.progress.cloned else 0.0, self.expected_length(), rng)
 
     @property
     def warmup_driver(self) -> str:
-        """Who drives the warm-up, in words."""
+        """What chooses the actions in the warm-up, in words."""
         guided = self.progress.cloned or (self.dataset and self.hyperparameters.needs_clone)
         return "the prior actor's actions" if guided else super().warmup_driver
 
@@ -230,12 +231,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     # // Update Models
 
     def steps_per_update(self) -> float:
-        """Return how many collected steps pay for the first update; a head start costs none."""
+        """Return how many collected steps the first update needs; a head start needs none."""
         pending = self.hyperparameters.actor_delay > self.progress.task_updates
         return 0.0 if pending else super().steps_per_update()
 
     def updates_due(self) -> int:
-        """Return how many updates to make now: those that are paid for, or the head start."""
+        """Return how many updates to make now: those for the collected steps, or the head start."""
         head_start = self.hyperparameters.actor_delay - self.progress.task_updates
         return max(super().updates_due(), head_start)
 
@@ -277,7 +278,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         progress.task_updates += 1
 
     def begin_residual(self) -> None:
-        """Keep the actor as it is now as the imitator, from which its corrections are measured."""
+        """Copy the actor: the imitator, by the difference to which the actor corrects the clone."""
         policy = self.policy
         if policy.imitator is None:
             policy.imitator = deepcopy(policy.actor)
@@ -292,7 +293,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     # The data and the task
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another D_off: whatever `open_dataset` takes, other people's files too."""
+        """Use another D_off, of any kind that the keyword `dataset` takes."""
         super().set_dataset(dataset)
         if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
             self.retrieved = None
@@ -303,9 +304,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return super().begun or bool(self.progress.retrieved_ids)
 
     def reset_task(self, keep_data: bool = False) -> None:
-        """Forget the task and keep the world model: replay, rewards, behaviour, retrieval go.
+        """Prepare for another task: keep the world model and discard everything else.
 
-        The optimisers, also that of the world model, start with new averages.
+        Replay buffer, reward head, actor, critic, prior actor and retrieved trajectories are
+        discarded. The optimisers, also that of the world model, start again with zero averages.
 
         :param keep_data: keep the collected episodes as reward-free data beside the dataset, so
             that the next task's trajectories are retrieved from both
@@ -323,8 +325,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def next_task(self, env: GymEnv | str) -> None:
         """Begin the next task of a sequence with the world model and the episodes of earlier ones.
 
-        The episodes are kept where there is a dataset to keep them beside. The schedules begin
-        again.
+        The episodes are kept only if the agent has a dataset. Schedules and the count of steps
+        begin again.
         """
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)

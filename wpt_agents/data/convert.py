@@ -1,7 +1,7 @@
-"""From anything that can serve as a dataset to a dataset: `open_dataset`, and the conversions.
+"""Make a dataset of anything that can serve as one: `open_dataset`, and the conversions.
 
-This module stands above `TrajectoryDataset` and fills its doors in (`TrajectoryDataset.of`,
-`.from_npz`, ...): the class itself knows no other format.
+This module assigns `TrajectoryDataset.of`, `TrajectoryDataset.from_npz` and the other constructors;
+the class itself knows no other format.
 """
 
 import hashlib
@@ -38,13 +38,13 @@ Data = One | Sequence[One] | Iterable[Trajectory]
 
 
 def open_dataset(data: Data) -> TrajectoryDataset:
-    """Open whatever can serve as a dataset.
+    """Open anything that can serve as a dataset.
 
-    - a dataset, or the path of one: the dataset itself;
-    - a path in one of `FORMATS`, or a local Minari dataset's name: converted once, into the cache
-      (see `cache_folder`); a conversion that was cut short goes on;
-    - replay buffers, a Trajectory, or any iterable of them: stored in a temporary folder;
-    - a list of any of these: a view of all as one dataset.
+    - A dataset, or the path of one: the dataset itself.
+    - The path of files in one of `FORMATS`, or the name of a local Minari dataset: it is converted
+      once, into the cache (see `cache_folder`); an interrupted conversion continues.
+    - A replay buffer, a Trajectory, or an iterable of Trajectories: stored in a temporary folder.
+    - A list of any of these: a view of all as one dataset.
 
     :raises ValueError: anything else; the message says what it is and what to do
     """
@@ -139,7 +139,7 @@ def _open_path(source: Source) -> TrajectoryDataset:
 def from_episodes(
     episodes: Episodes, path: Source, progress_bar: bool = False
 ) -> TrajectoryDataset:
-    """Append the episodes to the dataset at `path`; a conversion that was cut short goes on.
+    """Convert episodes into a dataset at `path`; an interrupted conversion continues.
 
     :raises ValueError: the dataset there does not begin with these episodes, or an episode cannot
         be converted; those before it are kept
@@ -203,7 +203,7 @@ def convert(
     form: str | None = None,
     **options: Any,
 ) -> TrajectoryDataset:
-    """Convert other people's data at `source` into a dataset at `path`.
+    """Convert data in another format at `source` into a dataset at `path`.
 
     :param form: a name in `FORMATS`; recognised by default
     :param options: keywords of the format's reader, such as `image_key` or `low` and `high`
@@ -213,11 +213,13 @@ def convert(
 
 def _door(form: str) -> Callable[..., TrajectoryDataset]:
     door = partial(convert, form=form)
-    door.__doc__ = f"Convert `{form}` data; `{FORMATS[form].__name__}` has the options."
+    door.__doc__ = f"Convert `{form}` data at `source` into a dataset at `path`; " + (
+        f"`{FORMATS[form].__name__}` has the options."
+    )
     return door
 
 
-# The doors of `TrajectoryDataset`, which is below this module.
+# The constructors of `TrajectoryDataset`, whose module cannot import this one.
 TrajectoryDataset.of = staticmethod(open_dataset)
 TrajectoryDataset.from_episodes = staticmethod(from_episodes)
 for _form in FORMATS:

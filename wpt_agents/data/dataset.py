@@ -1,4 +1,4 @@
-"""D_off, the non-curated offline data: trajectories in a folder, read lazily.
+"""The dataset of recorded trajectories (D_off of the paper): a folder, read lazily.
 
 Example::
 
@@ -36,14 +36,23 @@ Door = Callable[..., "TrajectoryDataset"]
 
 
 class TrajectoryDataset(StoredTrajectories):
-    """Trajectories in a folder (see `wpt_agents.data.shards`); one writer, any number of readers.
+    """Recorded trajectories in a folder, with one writer and any number of readers.
 
-    A reader sees the trajectories that were there when it opened the folder. Make one with
-    `create`, `open`, `of` (anything that can serve as a dataset) or a `from_...` (other formats).
+    Make a dataset with `create`, `open`, `of` (anything that can serve as a dataset) or one of
+    `from_hdf5`, `from_lerobot`, `from_minari`, `from_npz`, `from_official`, `from_rlds`,
+    `from_sb3`, `from_tdmpc2` and `from_zarr` (other formats). A reader sees the trajectories that
+    were there when it opened the folder. `wpt_agents.data.shards` describes the files.
+
+    Example::
+
+        with TrajectoryDataset.create("data/arm") as dataset:
+            dataset.append(Trajectory(image, action, embodiment="arm"))
+        dataset = TrajectoryDataset.open("data/arm")
+        batch = dataset.sample(16, 64)  # 16 sequences of 64 images
     """
 
-    # `wpt_agents.data.convert` stands above this class and fills these doors in; `wpt_agents.data`
-    # imports it, so they are always there.
+    # `wpt_agents.data.convert` assigns these constructors, since this class knows no other format;
+    # `wpt_agents.data` imports that module, so they are always there.
     of: ClassVar[Door]
     from_episodes: ClassVar[Door]
     from_hdf5: ClassVar[Door]
@@ -79,9 +88,10 @@ class TrajectoryDataset(StoredTrajectories):
     ) -> "TrajectoryDataset":
         """Make an empty dataset in a new or empty folder.
 
-        :param codec: "zstd" (lossless, about a sixth of simulated images), "raw" or "jpeg" (lossy,
-            about a fourth; for camera images, whose noise zstd cannot compress)
-        :param workers: threads that decompress
+        :param image_size: height and width of the images, to which others are resized
+        :param codec: "zstd" (lossless, a sixth of the size for simulated images), "raw", or "jpeg"
+            (lossy, a fourth of the size; for camera images, whose noise zstd cannot compress)
+        :param workers: number of threads that decompress
         :raises ValueError: an unknown codec, or a folder with something in it
         """
         find_codec(codec)
@@ -92,7 +102,8 @@ class TrajectoryDataset(StoredTrajectories):
     def open(cls, path: Source, workers: int = 0) -> "TrajectoryDataset":
         """Open a dataset. Only its index is read; trajectories that were set aside are left out.
 
-        :raises ValueError: no dataset there, one of a newer version, or a damaged index
+        :param workers: number of threads that decompress
+        :raises ValueError: there is no dataset, it is of a newer version, or its index is damaged
         """
         path = Path(path).expanduser()
         meta = read_meta(path)
@@ -102,8 +113,6 @@ class TrajectoryDataset(StoredTrajectories):
     @classmethod
     def open_or_create(cls, path: Source, image_size: int = IMAGE_SIZE) -> "TrajectoryDataset":
         """Open the dataset at `path`, or make an empty one where there is none.
-
-        A `create` that was killed halfway is repeated.
 
         :raises ValueError: as `open` and `create`
         """
@@ -120,11 +129,11 @@ class TrajectoryDataset(StoredTrajectories):
     ) -> "TrajectoryDataset":
         """Copy all trajectories of `datasets`, in their order, into a new dataset at `path`.
 
-        It has their codec, or "zstd" if they differ, so that nothing more is lost.
+        It has their codec, or the lossless "zstd" if their codecs differ.
 
-        :param image_size: resize the images to this; by default, the size that all have
-        :raises ValueError: no datasets, images of different sizes, a folder with something in it,
-            or a damaged trajectory; those before it are kept
+        :param image_size: resize the images to this size; required if the datasets' sizes differ
+        :raises ValueError: no datasets, images of different sizes, a folder that is not empty, or a
+            damaged trajectory; those before it are kept
         """
         opened = [d if isinstance(d, TrajectoryDataset) else cls.open(d) for d in datasets]
         sizes = {dataset.image_size: dataset.path for dataset in opened}
@@ -144,7 +153,7 @@ class TrajectoryDataset(StoredTrajectories):
 
     @classmethod
     def join(cls, datasets: Sequence["TrajectoryDataset"]) -> "TrajectoryDataset":
-        """A read-only view of several datasets as one; nothing is copied.
+        """Return a read-only view of several datasets as one; nothing is copied.
 
         :raises ValueError: no datasets, or images of different sizes
         """
@@ -177,7 +186,8 @@ class TrajectoryDataset(StoredTrajectories):
         Images of another size are resized, with one warning for each size.
 
         :param crop: cut out the middle square of images that are not square, instead of squeezing
-        :raises ValueError: numbers in the actions' padding, a read-only view, or another writer
+        :raises ValueError: non-zero numbers in the actions' padding, a read-only view, or another
+            process that writes
         """
         if trajectory.image.shape[1:3] != (self.image_size, self.image_size):
             self._resize.crop = crop
@@ -214,14 +224,14 @@ class TrajectoryDataset(StoredTrajectories):
             other._windows = None
 
     def reserve(self) -> None:
-        """Take the write lock now, not at the first append; what others appended becomes visible.
+        """Take the write lock now, not at the first append, and see what others appended.
 
-        :raises ValueError: another writer is at work, or this is a read-only view
+        :raises ValueError: another process writes, or this is a read-only view
         """
         self._begin()
 
     def _begin(self) -> Writer:
-        """The writer, which takes the lock when it is made and sees what others appended."""
+        """Return the writer, which takes the lock when it is made and sees what others appended."""
         if self.is_subset:
             raise ValueError("A subset is read-only; append to the dataset it was taken from")
         if self._writer is None:
@@ -230,7 +240,10 @@ class TrajectoryDataset(StoredTrajectories):
         return self._writer
 
     def flush(self) -> None:
-        """Make what was appended survive a power cut; it survives a killed process anyway."""
+        """Force what was appended to the disk, so that it survives a power failure.
+
+        Without it, appended trajectories survive a killed process, but not a power failure.
+        """
         if self._writer is not None:
             self._writer.flush()
 
@@ -248,7 +261,10 @@ class TrajectoryDataset(StoredTrajectories):
         self.close()
 
     def info(self) -> dict[str, Any]:
-        """Count trajectories, robots and bytes, as `wpt_agents.data.upkeep.describe` does."""
+        """Return counts of trajectories, transitions, robots, tasks and bytes as a dictionary.
+
+        `compression` is the ratio of the images' raw size to the stored size, actions included.
+        """
         return describe(self._folders, self._entries)
 
     @property
@@ -259,9 +275,9 @@ class TrajectoryDataset(StoredTrajectories):
     def validate(self, progress_bar: bool = False, set_aside: bool = False) -> list[Damage]:
         """Read every byte and list the damaged trajectories.
 
-        :param set_aside: leave the damaged ones out, here and for all who open the folder from now
-            on; the numbers of those behind them go down. The folder's damaged.json lists them, and
-            they come back when it is deleted
+        :param set_aside: exclude the damaged ones, here and for everybody who opens the folder from
+            now on; the trajectories after them move up in number. The file `damaged.json` in the
+            folder lists them; delete it to include them again
         """
         damaged = find_damage(self._reason, len(self), self._threads.map, progress_bar)
         if set_aside and damaged:

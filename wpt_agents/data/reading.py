@@ -1,4 +1,4 @@
-"""Stored trajectories as a reader sees them: by number, by sequence, or by batch."""
+"""Reading stored trajectories: by number, by sequence, or by batch."""
 
 import hashlib
 import time
@@ -50,9 +50,9 @@ class StoredTrajectories:
         return len(self._entries)
 
     def __getitem__(self, i: int) -> Trajectory:
-        """Trajectory `i`, whole, its actions `action_dim` wide.
+        """Return trajectory `i`, with actions of its true width.
 
-        :raises ValueError: it is damaged
+        :raises ValueError: the trajectory is damaged
         """
         entry = self._entries[i]
         part, _, _ = self._read((i % len(self), 0, entry.length + 1))
@@ -118,7 +118,7 @@ class StoredTrajectories:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the trajectories and their order; a retrieval index keeps its dataset's."""
+        """A hash of the trajectories and their order, by which a retrieval index is recognised."""
         digest = hashlib.sha256()
         for e in self._entries:
             # datasets of older versions have none, and keep their fingerprint
@@ -127,7 +127,7 @@ class StoredTrajectories:
         return digest.hexdigest()
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> Self:
-        """A read-only view of some trajectories, in the order of `indices`.
+        """Return a read-only view of some trajectories, in the order of `indices`.
 
         :param indices: their numbers, or a mask: a bool for each trajectory
         :raises ValueError: a mask of another length
@@ -145,7 +145,7 @@ class StoredTrajectories:
         return view
 
     def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
-        """The first image of every trajectory, in order: (n, S, S, 3) uint8 with n <= `batch`."""
+        """Yield all first images, in order: (n, S, S, 3) uint8 with n <= `batch` each time."""
         for at in range(0, len(self), batch):
             chunk = range(at, min(at + batch, len(self)))
             yield np.stack(list(self._threads.map(self._first_image, chunk)))
@@ -163,10 +163,12 @@ class StoredTrajectories:
         share: slice = slice(None),
         mark: bool = False,
     ) -> Batch:
-        """Draw sequences by the rule of `wpt_agents.data.windows`; `rng` alone decides which.
+        """Draw a batch of sequences; all sequences of all trajectories are equally likely.
 
-        :param action_width: the width of the batch's actions; `max_action_dim` by default
-        :param rng: other sequences at every call by default
+        :param batch_size: number of sequences
+        :param length: number of images in a sequence
+        :param action_width: width to which actions are padded; `max_action_dim` by default
+        :param rng: source of the random numbers; by default, every call draws other sequences
         :param share: the rows that are read, for one of several processes
         :param mark: return a `MarkedBatch`; it reads each trajectory once as a whole
         :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
@@ -202,14 +204,17 @@ class StoredTrajectories:
         share: slice = slice(None),
         mark: bool = False,
     ) -> Generator[Batch, None, None]:
-        """Yield batches without end; batch k is a function of (seed, purpose, k) alone.
+        """Yield batches without end; batch k depends on nothing but (seed, purpose, k).
 
+        :param batch_size: number of sequences
+        :param length: number of images in a sequence
+        :param action_width: width to which actions are padded
         :param purpose: a different number for each use that shares the seed
         :param start: the number of the first batch
-        :param ahead: how many are prepared in the background
-        :param pin: put them into pinned memory, from which a GPU copies while it computes
+        :param ahead: number of batches that are prepared in the background
+        :param pin: copy the batches into pinned memory, from which a GPU copies while it computes
         :param share: the rows of each batch that are read, for one of several processes
-        :param mark: make batches that mark what moves, `MarkedBatch`
+        :param mark: yield batches that mark the pixels that move, `MarkedBatch`
         """
 
         def draw(k: int) -> Batch:

@@ -1,7 +1,7 @@
-"""A trajectory as stored, a batch as the RSSM takes it, and the one place where the two meet.
+"""Stored trajectories, batches for the RSSM, and the conversion between their timings.
 
-The timing, once and for all. A stored trajectory is Gymnasium's: T actions, T rewards, T + 1
-images; action t was taken at image t, brought reward t and led to image t + 1::
+A stored trajectory has Gymnasium's timing: T actions, T rewards, T + 1 images. Action t was taken
+at image t, brought reward t and led to image t + 1::
 
     image   o_0      o_1      o_2   ...  o_T
     action      a_0      a_1        ...
@@ -43,8 +43,8 @@ class Trajectory:
     :param embodiment: the robot's name, if known
     :param task: the task of the behaviour, if known
     :param source: where the trajectory comes from, in words
-    :param bounds: (2, action_dim), the values in the robot's own units that -1 and 1 stand for;
-        None where that is not known
+    :param bounds: (2, action_dim), the values in the robot's own units that -1 and 1 stand for,
+        or None if they are unknown
     :raises ValueError: a wrong shape or dtype, NaN or infinity, an action outside [-1, 1]
     """
 

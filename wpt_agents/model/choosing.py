@@ -76,7 +76,7 @@ def corrected(
     The mean is the clone's action plus what imagination has changed: the difference between the
     actor and an actor that only imitates the clone. Where they agree, and before imagination, the
     clone acts, and not an imitation of it from latent states, which lack details of the images.
-    Corrections of a given policy: https://arxiv.org/abs/1812.03201
+    Source of learning corrections to a policy: https://arxiv.org/abs/1812.06298
 
     :param dist: the actor's, (N, A)
     :param state: (N, ...), where to act

@@ -84,7 +84,7 @@ def replay_value_loss(
 ) -> Tensor:
     """DreamerV3's replay value loss: -ln v(V_t | s_t) where the rewards are known.
 
-    It holds the critic to returns that were earned, where dreams may promise too much.
+    It trains the critic on returns that were earned, since imagined returns may be too high.
 
     :param logits: (B, T, bins) of the critic on detached replayed states
     :param replay_return: (B, T); no gradient reaches it

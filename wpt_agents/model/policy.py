@@ -50,11 +50,13 @@ class WPTPolicy(PixelPolicy):
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
     :param bin_range: largest value of reward head and critic, in symlog space
+    :param reward_ensemble: number of reward heads
+    :param continue_head: predict where episodes end
+    :param ibrl: take the prior actor's action where it is worth more than the actor's
+    :param residual: add to the prior actor's action what the actor has learned in imagination
     """
 
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
-    ibrl: bool = False  # whether the prior actor's action is taken where it is worth more
-    residual: bool = False  # whether the prior actor acts, corrected by what the actor has learned
     imitator: Actor | None  # the actor without imagination: an imitation of the prior actor alone
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
@@ -69,9 +71,15 @@ class WPTPolicy(PixelPolicy):
         zero_init_heads: bool = False,
         actor_outscale: float = 1.0,
         bin_range: float = BIN_RANGE,
+        reward_ensemble: int = 1,
+        continue_head: bool = False,
+        ibrl: bool = False,
+        residual: bool = False,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.updates = 0
+        self.ibrl = ibrl
+        self.residual = residual
         self.size = size
         self.max_action_dim = max_action_dim
         self.unimix = unimix
@@ -82,6 +90,9 @@ class WPTPolicy(PixelPolicy):
         self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
+        self.world_model.make_reward_members(range(reward_ensemble - 1))
+        if continue_head:
+            self.world_model.make_continue_head(0.0, 0)
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
@@ -105,7 +116,7 @@ class WPTPolicy(PixelPolicy):
     ) -> Any:
         """Load weights, as `torch.nn.Module.load_state_dict`.
 
-        Afterwards there is an average actor if the weights have one, and none otherwise.
+        Afterwards there are an average actor and an imitator if the weights have them.
         """
         self.updates += 1
         averaged = any(name.startswith("average_actor.") for name in state_dict)
@@ -194,7 +205,7 @@ class WPTPolicy(PixelPolicy):
         return state[-1], state
 
     def _with_frames(self, state: State, image: np.ndarray) -> State:
-        """Add or remove the images of a state, so that `ibrl` can change within an episode."""
+        """Add or remove the images of a state, so that keywords can change within an episode."""
         parts = len(state) if isinstance(state, tuple | list) else 0
         if self.sees_frames and parts == 3:
             return (*state[:2], stack_frames(image, None, None), state[2])
@@ -261,8 +272,12 @@ class WPTPolicy(PixelPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ["observation_space", "action_space", "size", "max_action_dim", "unimix"]
-        names += ["zero_init_heads", "actor_outscale", "bin_range"]
-        return {name: getattr(self, name) for name in names}
+        names += ["zero_init_heads", "actor_outscale", "bin_range", "ibrl", "residual"]
+        heads = {
+            "reward_ensemble": 1 + len(self.world_model.reward_members),
+            "continue_head": self.world_model.continue_head is not None,
+        }
+        return {name: getattr(self, name) for name in names} | heads
 
 
 @op

@@ -1,4 +1,4 @@
-"""The keywords of WPT: Table 2 of the paper, once, with what the paper has not.
+"""The keywords of WPT: Table 2 of the paper, and keywords that are not in the paper.
 
 A new keyword is declared here and used in one other place. The signature of `WPT`, its attributes,
 its documentation, its checks and the zoo's list of what pre-training depends on follow from it.
@@ -71,7 +71,7 @@ class Hyperparameters(Keywords):
         positive=True,
     )
     zero_init_heads: bool | None = switch(
-        None, "start reward head and critic at zero; that of the size if None", Stage.SIZE
+        None, "start reward head and critic at zero; None: the size decides", Stage.SIZE
     )
     actor_outscale: float = amount(
         1.0, "factor on the initial weights of the actor's last layer", Stage.SIZE
@@ -79,8 +79,8 @@ class Hyperparameters(Keywords):
     bin_range: float = keyword(
         BIN_RANGE,
         must("a number above 0", lambda value: is_number(value) and value > 0),
-        "the 255 bins of reward head and critic reach from minus to plus this, in symlog space: 20 "
-        "is a return of 485 million, 7 one of 1,096. What lies beyond is clipped",
+        "the 255 bins of reward head and critic reach from minus to plus this number, in symlog "
+        "space: 20 is a return of 485 million, 7 is one of 1,096. Larger returns are clipped",
         Stage.SIZE,
     )
     data_dependent_init: bool = switch(
@@ -108,86 +108,95 @@ class Hyperparameters(Keywords):
     batch_length: int = count(64, "T, images in a sequence", Stage.PRETRAINING)
     learning_rate: float | None = amount(
         None,
-        "learning rate of world model and reward head; that of the size if None",
+        "learning rate of world model and reward head; None: the size's value",
         Stage.PRETRAINING,
     )
     weight_decay: float = amount(
-        1e-6, "share by which every weight shrinks in a step", Stage.PRETRAINING
+        1e-6, "share by which every weight shrinks in an update", Stage.PRETRAINING
     )
     grad_clip: float = amount(
         100.0, "largest norm of the gradient of each network", Stage.PRETRAINING
     )
     dyn_scale: float = amount(1.0, "weight of the KL that trains the prior", Stage.PRETRAINING)
     rep_scale: float = amount(0.1, "weight of the KL that trains the posterior", Stage.PRETRAINING)
-    free_nats: float = amount(1.0, "KL below which it is not minimised further", Stage.PRETRAINING)
+    free_nats: float = amount(
+        1.0, "value in nats below which the KL is not minimised further", Stage.PRETRAINING
+    )
     free_nats_mode: str = choice(
-        "mean", ("mean", "element"), '"mean" (WPT) or "element" (DreamerV3)', Stage.PRETRAINING
+        "mean",
+        ("mean", "element"),
+        'what `free_nats` applies to: the "mean" KL of a batch (WPT) or each "element" of it '
+        "(DreamerV3)",
+        Stage.PRETRAINING,
     )
     pixel_weight: float = amount(
         1.0,
         "weight in Eq. (1) of the pixels that differ from their trajectory's median image, so that "
-        "small things that move are not lost in a large background; not in the paper. 1: off",
+        "small moving things are not lost in a large background; not in the paper. 1: off",
         Stage.PRETRAINING,
     )
     precision: str = choice(
         "fp32",
         ("fp32", "bf16"),
-        '"fp32", or "bf16" for the forward passes, on a CPU faster from size `small` on',
+        'precision of the forward passes: "fp32", or "bf16", which on a CPU is faster from size '
+        "`small` on",
         Stage.PRETRAINING,
     )
 
     # Actor and critic.
     actor_critic_learning_rate: float | None = amount(
-        None, "learning rate of actor and critic; that of the size if None"
+        None, "learning rate of actor and critic; None: the size's value"
     )
     actor_critic_decay: bool = switch(
         False,
-        "let the learning rate of actor and critic fall linearly to 0 over a call of `learn`, so "
-        "that the last policy is not the result of a few noisy updates; not in the paper",
+        "let the learning rate of actor and critic fall linearly to 0 during a call of `learn`, so "
+        "that the last policy does not depend on a few noisy updates; not in the paper",
     )
     actor_average: float = share(
         0.0,
-        "share by which a moving average of the actor follows it in an update; the average acts, "
-        "the actor itself imagines. Not in the paper; 0: the actor itself acts",
+        "share by which a moving average of the actor follows it in an update. The average acts in "
+        "the environment, the actor itself in imagination. Not in the paper; 0: off",
     )
     gamma: float = share(0.99, "discount factor")
-    lam: float = share(0.95, "λ of Eq. (2)")
+    lam: float = share(0.95, "λ of the λ-return, Eq. (2)")
     ent_coef: str | float = schedule(
         1e-4,
         np.inf,
         "η of Eq. (4), the weight of the entropy: a number, or a schedule such as "
-        "'linear(3e-3,3e-4,20000)', with which exploration fades",
+        "'linear(3e-3,3e-4,20000)', which falls from 3e-3 to 3e-4 over 20,000 steps",
     )
     imagine_horizon: int = count(  # the value of the first state is no action's
         16, "H, imagined steps", least=2
     )
     imagine_starts: int | None = count(
         None,
-        "replayed states of a batch from which actor and critic imagine, drawn at random; 0 for "
-        "all of them, as in the paper; that of the size if None",
+        "number of replayed states of a batch, drawn at random, from which actor and critic "
+        "imagine; 0 for all of them, as in the paper; None: the size's value",
         least=0,
     )
     target_fraction: float = share(
         0.02, "share by which the target critic moves to the critic in an update"
     )
     return_norm: bool | None = switch(
-        None, "divide returns by their 5-95 % range, if above 1; that of the size if None"
+        None, "divide returns by their 5-95 % range, if it is above 1; None: the size decides"
     )
     train_ratio: float = amount(
-        256, "replayed steps for each collected step; one update replays B x T of them"
+        256, "replayed steps for each collected step; an update replays B x T steps"
     )
-    offline_ratio: float = share(0.25, "share of retrieved sequences in a batch; 0: no rehearsal")
+    offline_ratio: float = share(
+        0.25, "share of retrieved sequences in a batch (experience rehearsal); 0: no rehearsal"
+    )
     kickstart: str | float = schedule(
         0.0,
         np.inf,
         "weight, or a schedule of it, of a loss with which the actor imitates the prior actor on "
-        "replayed images; not in the paper. 0: off; where the prior actor is good, try 20",
+        "replayed images; not in the paper. 0: off; if the prior actor is good, try 20",
     )
     actor_delay: int = count(
         0,
-        "updates of a head start, made when `learning_starts` is reached even if `train_ratio` "
-        "allows fewer: reward head and critic learn while the actor only imitates the prior actor; "
-        "not in the paper",
+        "number of updates of a head start, in which reward head and critic learn while the actor "
+        "only imitates the prior actor. They are made when `learning_starts` is reached, even if "
+        "`train_ratio` allows fewer. Not in the paper",
         least=0,
     )
 
@@ -216,24 +225,24 @@ class Hyperparameters(Keywords):
     reward_grad: float = amount(
         0.0,
         "weight of the reward loss in the training of the world model. At 0, as in the paper, "
-        "states hold only what reconstructing images needs; DreamerV3 has 1",
+        "latent states represent only what the reconstruction of images needs; DreamerV3 has 1",
     )
     imitation_grad: float = amount(
         0.0,
         "weight of the imitation loss (`kickstart`, `actor_delay`) in the training of the world "
-        "model, so that states hold what the prior actor's actions depend on. The loss is small: "
-        "weights of some hundreds have an effect. Not in the paper",
+        "model, so that latent states represent what the prior actor's actions depend on. The loss "
+        "is small: weights of some hundreds have an effect. Not in the paper",
     )
     reward_ensemble: int = count(
         1,
-        "number of reward heads; imagined rewards are their mean, less what `pessimism` subtracts",
+        "number of reward heads; imagined rewards are their mean, minus what `pessimism` subtracts",
     )
     pessimism: str | float = schedule(
         0.0,
         np.inf,
         "β, or a schedule of it: imagined rewards are the mean of the reward heads minus β times "
-        "their standard deviation, so that states of unknown reward are not sought; it should "
-        "fade, or exploration stops. Not in the paper",
+        "their standard deviation, so that the actor does not seek states of unknown reward. Let "
+        "it fade, or exploration stops. Not in the paper",
     )
     continue_head: bool = switch(
         True,
@@ -244,30 +253,31 @@ class Hyperparameters(Keywords):
     # Collecting.
     learning_starts: int | None = count(
         None,
-        "steps that are collected before the first update; their updates are then made as well; "
-        "that of the size if None, 5,000 for `paper`",
+        "steps that are collected before the first update; the updates for these steps are made "
+        "then, too. None: the size's value, 5,000 for `paper`",
         Stage.ACTING,
         least=0,
     )
     warmup_steps: int | None = count(
         None,
-        "first steps, in which the prior actor acts alone (without one, uniformly random actions); "
-        "that of the size if None, 7,500 for `paper`",
+        "number of first steps, in which the prior actor acts alone (without one, actions are "
+        "uniformly random). None: the size's value, 7,500 for `paper`",
         Stage.ACTING,
         least=0,
     )
     guidance: str | float | None = schedule(
         None,
         1.0,
-        "schedule of the probability that an episode is guided; 0: no guidance; that of the size "
-        "if None, 'linear(1,0,50000)' for `paper`",
+        "probability that an episode is guided by the prior actor: a number, or a schedule "
+        "'linear(start,end,steps)'; 0: no guidance. None: the size's value, 'linear(1,0,50000)' "
+        "for `paper`",
         Stage.ACTING,
     )
     ibrl: bool = switch(
         False,
-        "at each step that is not guided, also in `predict`, take the prior actor's action instead "
-        "of the actor's where the critic expects more of the state it leads to (IBRL); not in the "
-        "paper",
+        "at each step that is not guided, also in `predict`, let the critic choose between the "
+        "actions of actor and prior actor, by the values of the states that they lead to (IBRL); "
+        "not in the paper",
         Stage.ACTING,
     )
     residual: bool = switch(
@@ -279,21 +289,22 @@ class Hyperparameters(Keywords):
     )
     episode_length: int | None = count(
         None,
-        "steps of an episode, for the guidance window; that of the longest episode if None",
+        "number of steps of an episode, for the guidance window; None: that of the longest episode "
+        "so far",
         Stage.ACTING,
     )
     embodiment: str | None = keyword(
         None,
         Keywords.declared()["embodiment"].check,
-        "name of the robot; retrieval uses only data of this name or of none, and warns if there "
-        "is none",
+        "name of the robot; retrieval uses only trajectories of this name or without a name, and "
+        "warns if no trajectory has this name",
         Stage.ACTING,
     )
 
     # Retrieval and the prior actor.
     num_retrieve: int | None = count(
         None,
-        "R, trajectories to retrieve; that of the size if None, 500 for `paper`",
+        "R, number of trajectories to retrieve. None: the size's value, 500 for `paper`",
         Stage.RETRIEVAL,
     )
     retrieval: str = choice(
@@ -304,20 +315,19 @@ class Hyperparameters(Keywords):
     )
     retrieval_images: int = count(
         1,
-        "first images of the task that Eq. (5) compares; each finds its nearest trajectories in "
-        "turn. Above 1 the environment is reset that often before anything is collected, and "
-        "retrieval confuses fewer tasks that look alike",
+        "number of first images of the task that Eq. (5) compares; each contributes its nearest "
+        "trajectories in turn. Above 1, the environment is reset that many times before anything "
+        "is collected, and retrieval confuses fewer tasks that look alike",
         Stage.RETRIEVAL,
     )
     bc_steps: int | None = count(
         None,
-        "updates of the prior actor; that of the size if None, 150,000 for `paper`",
+        "number of updates of the prior actor. None: the size's value, 150,000 for `paper`",
         Stage.CLONING,
     )
     bc_batch_size: int | None = count(
         None,
-        "images and actions in an update of the prior actor; that of the size if None, 256 for "
-        "`paper`",
+        "batch size of the prior actor. None: the size's value, 256 for `paper`",
         Stage.CLONING,
     )
     bc_learning_rate: float = amount(
@@ -339,6 +349,12 @@ class Hyperparameters(Keywords):
                 f"kickstart looks at {FRAMES} images in a row, but batch_length="
                 f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
             )
+        if self.actor_delay and self.needs_clone and self.batch_length < FRAMES:
+            raise ValueError(
+                f"actor_delay imitates the prior actor, which looks at {FRAMES} images in a row, "
+                f"but batch_length={self.batch_length}: use batch_length={FRAMES} or more, or "
+                "actor_delay=0"
+            )
 
     @property
     def marks(self) -> bool:
@@ -347,7 +363,7 @@ class Hyperparameters(Keywords):
 
     @property
     def pessimistic(self) -> bool:
-        """Whether dreams are ever paid less than the mean of the reward heads."""
+        """Whether imagined rewards are ever lower than the mean of the reward heads."""
         return ever(parse_schedule(self.pessimism, np.inf, "pessimism"))
 
     def pessimism_at(self, step: int) -> float:

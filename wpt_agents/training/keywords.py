@@ -162,26 +162,26 @@ class Keywords:
     )
     warmup_steps: int | None = count(
         1_000,
-        "first steps, with uniformly random actions, up to the end of an episode",
+        "number of first steps, in which actions are uniformly random; it ends with an episode",
         Stage.ACTING,
         least=0,
     )
     max_trajectory_length: int = count(
         1_000,
-        "steps after which an open episode is stored as a trajectory of its own, so that long and "
-        "endless episodes can be replayed while they go on. Each has a guidance window",
+        "steps after which an unfinished episode is stored as a trajectory of its own, so that "
+        "long and endless episodes are replayed while they go on. Each part has a guidance window",
         Stage.ACTING,
     )
     train_freq: str = choice(
         "episode",
         ("episode", "step"),
-        "when updates are made: 'episode', at the end of each, or 'step', while the environments "
-        "take the next step. Worker processes (`SubprocVecEnv`) then step at the same time; what "
-        "is learned is the same without them",
+        "when updates are made: 'episode', at the end of each episode, or 'step', while the "
+        "environments take the next step. With `SubprocVecEnv`, environments and updates then run "
+        "at the same time; the results are the same with `DummyVecEnv`",
         Stage.ACTING,
     )
     seed: int | None = count(
-        None, "seed of everything that is drawn at random", Stage.PRETRAINING, least=0
+        None, "seed of all random numbers; None: a random seed", Stage.PRETRAINING, least=0
     )
 
     def __post_init__(self) -> None:

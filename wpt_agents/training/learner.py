@@ -35,7 +35,7 @@ from wpt_agents.training.world_model_learner import WorldModelLearner
 
 
 class Imagined(NamedTuple):
-    """Dreams and what they promise: N starts, H steps."""
+    """Imagined trajectories with their rewards, values and returns: N starts, H steps."""
 
     dream: Dream
     reward: Tensor  # (N, H)
@@ -182,7 +182,7 @@ class Learner(WorldModelLearner):
         """Train actor and critic on imagined trajectories, Eq. (2) to (4).
 
         During the head start (`actor_delay`) the actor's loss is the imitation alone, and without a
-        prior actor it is not updated: reward head and critic first learn what the dreams are worth.
+        prior actor it is not updated: reward head and critic learn first.
 
         :param start: (N, ...), the states to start from
         :param starts: (N,), their numbers in the batch
@@ -260,9 +260,9 @@ class Learner(WorldModelLearner):
         )
 
     def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
-        """Return what arriving in the imagined states 0 .. H-1 pays, (N, H).
+        """Return the rewards of arriving in the imagined states 0 .. H-1, (N, H).
 
-        :param starts: (N,), the numbers of the dreams' first states in the batch
+        :param starts: (N,), the numbers of the starting states in the batch
         """
         model = self.policy.world_model
         states = dream.states.but_last()

@@ -40,6 +40,9 @@ def test_the_model_bench_prints_a_json_object_for_each_case():
         assert torch.cuda.is_available() or row["onednn_gflop_per_s"] > 1
     alone, whole = rows
     assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
+    assert (alone["imagined"], whole["imagined"]) == (0, 2 * 8 * 16)  # from every state, 16 steps
+    few = WPT(size="debug", imagine_starts=4, imagine_horizon=3)
+    assert bench_model.imagined_states(few, bench_model.synthetic_batch(2, 8)) == 4 * 3
 
 
 def test_the_gpu_bench_measures_both_steps_and_needs_a_gpu():

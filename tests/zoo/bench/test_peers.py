@@ -26,7 +26,7 @@ def test_a_peer_learns_from_the_same_batch_beside_ours(peer):
         assert theirs["ratio_to_ours"] == pytest.approx(theirs["median_s"] / mine["median_s"])
         assert theirs["params"] == pytest.approx(mine["params"], rel=0.35)
         assert theirs["gflop"] > 0 and theirs["rss_mb"] > 0
-    assert [row["imagined"] for row in rows] == [0, 0, 16, 15]
+    assert [row["imagined"] for row in rows] == [0, 0, 16 * 16, 16 * 15]  # a batch of 2 x 8
 
 
 @pytest.mark.filterwarnings("ignore")  # of the peer's package, where it is installed

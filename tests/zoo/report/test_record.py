@@ -1,5 +1,6 @@
 """The record of results: what stands in it, how it grows, what it says together."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -166,10 +167,20 @@ def test_three_suites_have_no_mean_of_both():
 
 def test_the_pages_rows_are_those_of_the_records_tables():
     root = Path(__file__).parents[3]
-    table = (root / "zoo" / "results" / "small-benchmark.md").read_text()
+    table = (root / "zoo" / "results" / "small-benchmark.md").read_text().splitlines()
     page = (root / "docs" / "small-benchmark.md").read_text().splitlines()
-    rows = [line for line in page if line.startswith(("| dmc", "| metaworld", "| both |"))]
-    assert len(rows) > 30 and set(rows) <= set(table.splitlines())
+    ablation = [line for line in page if line.startswith(("| dmc-", "| metaworld-"))]
+    assert len(ablation) == 12 and set(ablation) <= set(table)
+    begin = page.index("| method | DMControl | Meta-World | both |") + 2
+    scores = page[begin : page.index("", begin)]  # a row for each method, a column for each suite
+    assert len(scores) == 7
+    for row in scores:
+        method, *cells = [cell.strip() for cell in row.strip("|").split("|")]
+        for suite, cell in zip(("dmc", "metaworld", "both"), cells, strict=True):
+            matching = [
+                x for x in table if re.match(rf"\| {suite} \| {method} \| \d+ \| \d+ \|", x)
+            ]
+            assert not cell or matching[0].endswith(f"| {cell} |")
 
 
 def test_methods_are_told_from_doing_nothing_to_ours():

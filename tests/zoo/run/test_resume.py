@@ -11,13 +11,15 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from debug_agent import same, weights
+from debug_agent import pretrained, recorded, same, weights
 from dot_runs import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 from stable_baselines3.common.logger import configure
+from toy_env import LENGTH
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
@@ -255,6 +257,21 @@ def test_an_episode_depends_on_its_number_and_on_none_before_it():
     other.env_method("go_to_episode", 2)
     np.testing.assert_array_equal(other.reset(), images[2])
     np.testing.assert_array_equal(other.reset(), images[3])
+
+
+def test_a_run_that_retrieved_by_several_images_goes_on_with_the_episode_that_was_next(tmp_path):
+    data = [recorded(seed=seed) for seed in range(4)]
+    settings = {"action_repeat": 1, "rendering": "fast"}
+    one, other = (make_vec_env(DOT.id, settings, seed=3) for _ in range(2))
+    model = pretrained(data, env=one, retrieval_images=3).learn(2 * LENGTH)
+    model.save(tmp_path / "model")
+    loaded = WPT.load(tmp_path / "model", env=other, dataset=data)
+    nothing = SimpleNamespace(restore=lambda agent, folder: None)
+    learning.resume(job(tmp_path), loaded, nothing)
+    for goes_on in (model, loaded):
+        goes_on.learn(LENGTH, reset_num_timesteps=False)
+    images = [agent.replay_buffer.trajectories[-1].image[0] for agent in (model, loaded)]
+    np.testing.assert_array_equal(*images)
 
 
 SCRIPT = """

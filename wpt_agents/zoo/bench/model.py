@@ -22,7 +22,7 @@ from wpt_agents.zoo.bench.timing import (
 
 ACTIONS = 6
 CASES = (  # size, batch, length; `bench scaling` shows what grows with each
-    *((size, 16, 16) for size in ("debug", "tiny", "small", "medium")),
+    *((size, 16, 16) for size in ("debug", "tiny", "mid", "small", "medium")),
     *((size, 16, 64) for size in ("tiny", "small")),
 )
 
@@ -46,11 +46,12 @@ def updates(
     columns = {"size": size, "batch": batch, "length": length, "dtype": precision}
     columns |= {"compiled": True} if compiled else {}
     networks = model.policy.world_model, model.policy.actor, model.policy.critic
-    for what, make, params in (
-        ("world model", world_model_step, count(networks[0])),
-        ("whole update", whole_step, count(*networks)),
+    for what, make, params, imagined in (
+        ("world model", world_model_step, count(networks[0]), 0),
+        ("whole update", whole_step, count(*networks), imagined_states(model, data)),
     ):
-        case = make(model, data), columns | {"what": what, "params": params}
+        row = {"what": what, "params": params, "imagined": imagined}
+        case = make(model, data), columns | row
         yield from measured_in_turn([case], repetitions, counted=[make(plain, data)])
 
 
@@ -154,6 +155,12 @@ def world_model_step(model: WPT, batch: Batch, learn_reward: bool = False) -> Ca
 def whole_step(model: WPT, batch: Batch) -> Callable[[], Any]:
     """`WPT.update` on `batch`: world model, reward, imagination, actor and critic."""
     return lambda: model.learner.update(batch, generator(model))
+
+
+def imagined_states(model: WPT, batch: Batch) -> int:
+    """Return how many states an update imagines: its starts (`imagine_starts`) times its steps."""
+    starts = model.learner.draw_starts(batch, generator(model))
+    return len(starts) * model.imagine_horizon
 
 
 def generator(model: WPT) -> torch.Generator:

@@ -25,6 +25,7 @@ from wpt_agents.zoo.bench.model import (
     ACTIONS,
     agent,
     count,
+    imagined_states,
     measured_in_turn,
     synthetic_batch,
     whole_step,
@@ -44,7 +45,7 @@ class Learner(NamedTuple):
 
     name: str
     params: tuple[int, int]
-    imagined: int  # steps from each state of the batch
+    imagined: int  # states in an update: its starts times its steps
     steps: tuple[Callable[[], Any], Callable[[], Any]]
 
 
@@ -81,7 +82,7 @@ def ours(model: WPT, batch: Batch) -> Learner:
     return Learner(
         "wpt_agents",
         (count(nets[0]), count(*nets)),
-        model.imagine_horizon,
+        imagined_states(model, batch),
         (world_model_step(model, batch, learn_reward=True), whole_step(model, batch)),
     )
 
@@ -109,7 +110,7 @@ def sheeprl(size: Size, batch: Batch) -> Learner:
     return Learner(
         f"sheeprl {version('sheeprl')}",
         (count(world), count(world, actor, critic)),
-        HORIZON,
+        HORIZON * batch.is_first.numel(),
         (
             lambda: theirs.world_model_learning(fabric, cfg, world, optimizers[0], data),
             lambda: theirs.train(fabric, *nets, *optimizers, data, *rest),
@@ -171,7 +172,7 @@ def torchrl(size: Size, batch: Batch) -> Learner:
     return Learner(
         f"torchrl {version('torchrl')}",
         (count(learner.world_model), sum(trained)),
-        HORIZON,
+        HORIZON * batch.is_first.numel(),
         (world_model, lambda: update.step(None, data.clone(recurse=False))),
     )
 

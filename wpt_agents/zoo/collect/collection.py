@@ -62,25 +62,30 @@ def collect(
     policy: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> TrajectoryDataset:
-    """Plays `episodes` of each task and stores them; what `path` holds already is kept.
+    """Play episodes of each task and store them in a dataset, without rewards by default.
 
-    The data are a function of the arguments, `workers` and interruptions apart. Workers are fresh
-    processes: call this from a script under `if __name__ == "__main__":`.
+    The same arguments and seed give the same data with any number of workers, and after
+    interruptions. Several workers are new processes: call this from a script under
+    `if __name__ == "__main__":`.
 
-    :param path: a folder; a finished one is returned unchanged, an unfinished one is continued
+    :param path: a folder; a finished collection is returned unchanged, an unfinished one continued
     :param tasks: ids for `gymnasium.make`
+    :param episodes: number of episodes of each task
+    :param seed: seed of the episodes
+    :param workers: number of processes
     :param behaviour: "noise", of random colour and strength; "random", uniform; "scripted",
         Meta-World's scripts with noise, elsewhere "noise"; "policy", a saved one with noise; "icm"
         or "plan2explore", a curious agent for each task, which learns from pixels;
         "explore-state", one that learns from the simulator's state, at five stages of its training
     :param env: keyword arguments of `gymnasium.make`
+    :param progress_bar: show a progress bar
     :param rewards: store the rewards, too
-    :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, in turn
-        by episode
-    :param policy: a WPT model file, or one of SB3's as "sac:expert.zip"; takes images, or states
-        where the environment tells them
-    :param settings: keywords of WPT for a curious agent, beside `curious.EXPLORE`; `steps` of
-        "explore-state"
+    :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, which
+        the episodes use in turn
+    :param policy: a WPT model file, or one of SB3's as "sac:expert.zip". It takes images, or the
+        simulator's state if it was trained on states
+    :param settings: keywords of WPT for a curious agent, in addition to `curious.EXPLORE`; `steps`
+        of "explore-state"
     """
     _check(tasks, episodes, behaviour, policy)
     _check_settings(behaviour, settings or {})

@@ -25,14 +25,24 @@ Peer = StrEnum("Peer", ["sheeprl", "torchrl"])
 Precision = StrEnum("Precision", ["fp32", "bf16"])
 
 
-CaseOption = Annotated[Case, typer.Argument(help="What to measure.")]
+CaseOption = Annotated[
+    Case,
+    typer.Argument(
+        help="What to measure. model: updates; scaling: their cost by batch, length and size; "
+        "profile: one update by operator; work: counted operations; gpu: a step on a GPU; policy: "
+        "acting; replay and data: reading batches; envs: rendering; retrieval; prediction; "
+        "exploration; threads: several threads on a busy machine."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")]
 Quick = Annotated[
     bool, typer.Option(help="Only check that it runs, in seconds; the numbers mean little.")
 ]
 Threads = Annotated[
     int,
-    typer.Option(min=1, help="Threads of torch; the case model alternates them with one thread."),
+    typer.Option(
+        min=1, help="The number of threads; the case model compares them with a single thread."
+    ),
 ]
 PrecisionOption = Annotated[Precision, typer.Option(help="The precision of the forward passes.")]
 Compiled = Annotated[
@@ -50,7 +60,7 @@ Plot = Annotated[
     Path | None, typer.Option(help="For scaling: draw the measurements into this file.")
 ]
 Updates = Annotated[
-    int | None, typer.Option(min=1, help="For prediction: the updates of each model.")
+    int | None, typer.Option(min=1, help="For prediction: the number of updates of each model.")
 ]
 Behaviour = Annotated[
     list[str] | None,

@@ -42,13 +42,16 @@ Out = Annotated[
 ]
 Episodes = Annotated[
     int | None,
-    typer.Option(min=1, help="Episodes per task; by default as many as in the paper."),
+    typer.Option(
+        min=1, help="The number of episodes of each task; by default as many as in the paper."
+    ),
 ]
 Behaviour = Annotated[
     str,
     typer.Option(
-        help="How to act: noise, random, scripted (Meta-World), policy, explore-state, icm or "
-        "plan2explore. By default scripted in metaworld and noise elsewhere."
+        help="What chooses the actions: noise, random, scripted (Meta-World), policy (a saved "
+        "one), explore-state, icm or plan2explore (curious agents). By default scripted in "
+        "metaworld and noise elsewhere."
     ),
 ]
 Sigma = Annotated[
@@ -74,7 +77,11 @@ Settings = Annotated[
     ),
 ]
 RenderingOption = Annotated[
-    Rendering, typer.Option(help="The quality of the images; fast has no shadows.")
+    Rendering,
+    typer.Option(
+        help="The quality of the images: exact, as the simulator's; near; or fast, without "
+        "shadows. Use the same in the task."
+    ),
 ]
 Seed = Annotated[int, typer.Option(help="The seed of the episodes.")]
 

@@ -1,4 +1,4 @@
-"""The command that converts other people's data: import."""
+"""The command that converts data in other formats: import."""
 
 import warnings
 from pathlib import Path
@@ -48,12 +48,12 @@ Shifted = Annotated[
     bool | None,
     typer.Option(
         "--shifted/--no-shifted",
-        help="For hdf5 and zarr: whether the action of a row led to its observation (dm_env) or "
-        "was taken at it.",
+        help="For hdf5 and zarr: the action of a row led to its observation (--shifted, as in "
+        "dm_env), or was taken at it (--no-shifted). By default the format decides.",
     ),
 ]
 Camera = Annotated[
-    str | None, typer.Option(help="For lerobot: the name of the camera, as --image-key.")
+    str | None, typer.Option(help="For lerobot: the name of the camera, the same as --image-key.")
 ]
 Split = Annotated[
     str | None, typer.Option(help="For rlds: read only this split, for example train.")
@@ -93,7 +93,7 @@ def import_data(
     high: High = None,
     trust: Trust = False,
 ) -> None:
-    """Convert other people's data into a dataset; the same command continues an unfinished one.
+    """Convert data in another format into a dataset; the same command continues a conversion.
 
     Example: `python -m wpt_agents.zoo import npz exorl/walker data/walker --embodiment walker`
     """

@@ -1,4 +1,4 @@
-"""The command that converts model files from and to other people's formats: import-model."""
+"""The command that converts model files from and to other formats: import-model."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +21,7 @@ def import_model(
         typer.Option(help="The number of groups of z, if it is not the authors' 32."),
     ] = None,
 ) -> None:
-    """Convert a model file in another format into a model file of WPT, which every command takes.
+    """Convert a model file of the paper's authors into a model file of WPT.
 
     Example: `python -m wpt_agents.zoo import-model official dmcontrol.pt dmcontrol.zip`
 

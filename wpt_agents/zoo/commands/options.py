@@ -31,12 +31,12 @@ class Spaced(TyperCommand):
 
 Rendering = StrEnum("Rendering", ["exact", "near", "fast"])
 Suite = Annotated[
-    str, typer.Option(help="The suite of tasks: dmc, or another one that `list` shows.")
+    str, typer.Option(help="The suite of tasks: dmc (DeepMind Control), metaworld or robotics.")
 ]
 Tasks = Annotated[
     list[str],
     typer.Option(
-        help="Names of tasks or patterns, e.g. `walker-run 'cheetah-*'`; by default the paper's."
+        help="Names of tasks, or patterns: `walker-run 'cheetah-*'`; by default the paper's tasks."
     ),
 ]
 Settings = Annotated[
@@ -44,7 +44,7 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="A change of the preset: a keyword of WPT (`gamma=0.98`), or `section.key=value` "
+        help="Changes of the preset: keywords of WPT (`gamma=0.98`), or `section.key=value` "
         "(`pretrain.steps=500`, `env.rendering=near`).",
     ),
 ]
@@ -52,7 +52,8 @@ Workers = Annotated[
     int,
     typer.Option(
         min=1,
-        help="Processes that collect data, and simultaneous runs of `--engine local`.",
+        help="The number of processes that collect data, and of simultaneous runs with "
+        "`--engine local`.",
     ),
 ]
 

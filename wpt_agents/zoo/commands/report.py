@@ -12,7 +12,7 @@ def report(
     ] = Path("runs"),
     markdown: Annotated[bool, typer.Option(help="Print Markdown instead of a table.")] = False,
     csv: Annotated[
-        bool, typer.Option(help="Print a line for every policy, as CSV, instead.")
+        bool, typer.Option(help="Print CSV with a line for every policy instead of a table.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option(help="The folder of the page; by default `report` in FOLDER.")
@@ -20,7 +20,7 @@ def report(
     record: Annotated[
         Path | None,
         typer.Option(
-            help="A CSV file that gets a line for every policy and run; lines of other runs stay."
+            help="A CSV file to which a line for every policy and run is added; other lines stay."
         ),
     ] = None,
     media: Annotated[
@@ -36,9 +36,10 @@ def report(
     The page is one file that needs no network: the paper's tables beside yours, aggregates with
     intervals, learning curves, videos, the command behind each number, and what failed. Markdown
     and CSV files beside it have the numbers of every policy: doing nothing, random, prior actor and
-    the agent. A record (--record results.csv) is small enough to keep when the run folders are
-    deleted; results.md and results.png beside it show the same. Where FOLDER has no finished run,
-    these two are written again from the record alone.
+    the agent.
+
+    --record keeps the numbers when the run folders are deleted; a Markdown page and a picture are
+    written beside the CSV file. If FOLDER has no finished run, only these two are written again.
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """

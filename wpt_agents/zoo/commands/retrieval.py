@@ -7,7 +7,7 @@ import typer
 
 from wpt_agents.zoo.commands.options import Rendering, Suite
 
-retrieve = typer.Typer(no_args_is_help=True, help="Show what retrieval finds.")
+retrieve = typer.Typer(no_args_is_help=True, help="Show or measure what retrieval finds.")
 
 
 Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
@@ -40,7 +40,7 @@ def show_retrieval(
 ) -> None:
     """Draw first images beside the trajectories that start most like them, with distances.
 
-    Without --query and --task, the queries are some trajectories of the dataset.
+    Without --query and --task, the first images of some trajectories of the dataset are used.
 
     Example: `python -m wpt_agents.zoo retrieve show data/two --model m.zip --task walker-run`
     """
@@ -77,7 +77,9 @@ def share_retrieval(
     ] = [1, 5, 10, 20, 40],  # noqa: B006
     seed: Annotated[int, typer.Option(help="The seed of the first episode.")] = 0,
 ) -> None:
-    """Print the share of retrieved trajectories that are of the task, by number of first images.
+    """Print the share of retrieved trajectories that are of the right task.
+
+    There is a column for each number of first images that are compared (--images).
 
     Example: `python -m wpt_agents.zoo retrieve share data/mw --model metaworld-mid --task reach`
     """

@@ -9,14 +9,18 @@ from wpt_agents.zoo.commands.options import Device, Settings, Suite, Tasks, Work
 
 PresetName = Annotated[
     str,
-    typer.Option(help="How large the run is: debug, demo, tiny, mid, small, medium, paper, ..."),
+    typer.Option(
+        help="The settings, by size: debug, demo, tiny, mid, small, medium or paper (zoo/*.yaml)."
+    ),
 ]
-Out = Annotated[Path, typer.Option(help="The folder for run folders and for what runs share.")]
+Out = Annotated[
+    Path, typer.Option(help="The folder for run folders, and for data and models that they share.")
+]
 Data = Annotated[
     Path | None, typer.Option(help="A dataset to use instead of collecting the preset's data.")
 ]
 Seeds = Annotated[
-    str, typer.Option(help="How many seeds (`3` is 0, 1, 2), which ones (`0,5`), or `0-2`.")
+    str, typer.Option(help="The number of seeds (`3` is 0, 1, 2), or which ones (`0,5` or `0-2`).")
 ]
 MethodNames = Annotated[
     list[str],
@@ -26,7 +30,11 @@ MethodNames = Annotated[
     ),
 ]
 Frames = Annotated[
-    int | None, typer.Option(help="Simulator frames of fine-tuning (`learn.frames`).")
+    int | None,
+    typer.Option(
+        help="The number of simulator frames of fine-tuning, in place of the preset's: calls of "
+        "env.step times the action repeat."
+    ),
 ]
 SequenceName = Annotated[
     str,
@@ -40,8 +48,8 @@ FromNothing = Annotated[
     bool,
     typer.Option(
         "--from-nothing",
-        help="Pre-train a world model even if the preset starts from one that ships "
-        "(`--set pretrain.model=`).",
+        help="Pre-train a world model even if the preset starts from one that comes with the "
+        "library (as `--set pretrain.model=`).",
     ),
 ]
 DryRun = Annotated[bool, typer.Option(help="Only show what would be run.")]
@@ -51,8 +59,8 @@ Watch = Annotated[
 Engine = Annotated[
     str,
     typer.Option(
-        help="Where runs execute. none: here, one after the other; local: each in its own "
-        "process, `--workers` at a time; ray: on a cluster; slurm: as jobs of submitit."
+        help="Where runs execute. none: in this process, one after the other; local: each in its "
+        "own process, `--workers` at a time; ray: on a Ray cluster; slurm: as Slurm jobs."
     ),
 ]
 Cpus = Annotated[int, typer.Option(min=1, help="CPU cores to reserve for each run of an engine.")]
@@ -65,7 +73,9 @@ Memory = Annotated[
 ]
 Hours = Annotated[
     float,
-    typer.Option(help="The time limit of a Slurm job; unfinished runs are submitted again."),
+    typer.Option(
+        help="The time limit of a Slurm job in hours; unfinished runs continue in another."
+    ),
 ]
 Retries = Annotated[
     int, typer.Option(min=0, help="How often a run is continued after its worker was killed.")
@@ -120,10 +130,15 @@ def pretrain_model(
     workers: Workers = 2,
     device: Device = "auto",
     accumulate: Annotated[
-        int, typer.Option(min=1, help="Parts that a batch is processed in; more save memory.")
+        int,
+        typer.Option(
+            min=1, help="The number of parts in which a batch is processed, to save memory."
+        ),
     ] = 1,
 ) -> None:
-    """Pre-train the world model of a preset, on its data or yours; `run` reuses it.
+    """Pre-train a world model with the settings of a preset, on its data or yours.
+
+    `run` with the same preset and data reuses the model.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
 
@@ -175,10 +190,10 @@ def run_benchmark(
     address: Address = "",
     partition: Partition = "",
 ) -> None:
-    """Run the whole method: collect, pre-train, index, fine-tune, evaluate.
+    """Run the whole method: collect data, pre-train, fine-tune and evaluate.
 
     Each task, method and seed gets a run folder with its configuration, logs, model, learning
-    curve, video and `result.json`. Finished stages are reused.
+    curve, video and `result.json`. A command that was interrupted continues where it stopped.
 
     Example: `python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --seeds 3`
 

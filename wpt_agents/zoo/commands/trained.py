@@ -68,7 +68,7 @@ def enjoy_model(
     ] = 256,
     device: Device = "auto",
 ) -> None:
-    """Film an episode of a trained model to an mp4, which any browser plays.
+    """Record a video of an episode of a trained model.
 
     With `--out policy.gif` it writes a GIF at half speed. Beside the episode are true images above
     those that the world model predicts from the first five images and all actions.
@@ -94,7 +94,7 @@ def diagnose_model(
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
     device: Device = "auto",
 ) -> None:
-    """Compare the rewards and values that a model predicts with those that it then earns.
+    """Compare the rewards and values that a model predicts with the rewards that it then earns.
 
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
@@ -110,7 +110,11 @@ def judge_predictions(
     ],
     data: Annotated[Path, typer.Argument(help="A dataset that the model was not trained on.")],
     episodes: Annotated[
-        int, typer.Option(min=1, help="The largest number of episodes per robot, spread evenly.")
+        int,
+        typer.Option(
+            min=1,
+            help="The number of episodes of each robot at most, evenly spaced in the dataset.",
+        ),
     ] = 8,
     out: Annotated[
         Path | None,
@@ -120,7 +124,9 @@ def judge_predictions(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Measure how well a world model predicts: its error by horizon, beside simple baselines.
+    """Measure how well a world model predicts: its error at each horizon, beside simple baselines.
+
+    The model sees five images of an episode, and predicts the others from the actions alone.
 
     Example: `python -m wpt_agents.zoo open-loop walker.zip data/unseen --out predictions`
     """

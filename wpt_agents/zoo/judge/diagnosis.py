@@ -1,8 +1,8 @@
-"""Why a policy earns what it earns: what its world model promises, beside what then happens.
+"""Compare the rewards and values that a model predicts with those that it then earns.
 
-An actor that learns in imagination is as good as the model is. Where the dream of its own actions
-pays far more than reality, it exploits the model's errors; where the dream of the actions that were
-taken does, the dynamics are wrong; where the critic alone promises more, the critic is.
+If the imagined reward of the actor's own actions is far above the earned one, the actor exploits
+errors of the model. If that of the actions that were taken is, too, the dynamics are wrong. If only
+the critic's value is too high, the critic is wrong.
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,15 @@ STARTS = 5  # states of an episode, evenly spaced
 
 @dataclass(frozen=True)
 class Promise:
-    """From one state of an episode on: rewards a step over the horizon, and the return.
+    """Predicted and earned rewards from one state of an episode on.
 
-    :param start: the state's step; a mean where episodes differ in length
-    :param earned: what was earned
-    :param same_actions: what the model expects of the actions that were taken
-    :param own_actions: what it expects of the actor
-    :param value: the critic's
-    :param discounted: what that stands for, Eq. (2)'s return to the episode's end: of arriving in
-        the state, and discounted of all that follows
+    :param start: the step of the state; a mean if episodes differ in length
+    :param earned: the reward per step that was earned over the horizon
+    :param same_actions: the reward per step that the model predicts for the actions that were taken
+    :param own_actions: the reward per step that it predicts for the actor's actions
+    :param value: the critic's value of the state
+    :param discounted: the return that `value` estimates, Eq. (2) to the end of the episode: the
+        reward of arriving in the state, and the discounted rewards that follow
     """
 
     start: float
@@ -54,7 +54,7 @@ class Promise:
 def promises(
     policy: WPTPolicy, trajectory: Trajectory, gamma: float, starts: Sequence[int], horizon: int
 ) -> list[Promise]:
-    """What the networks expect at some steps of an episode, and what came.
+    """Return predicted and earned rewards at some steps of an episode.
 
     :param trajectory: with rewards, its actions in [-1, 1]
     :param starts: steps, each at least `horizon` before the end
@@ -97,11 +97,11 @@ def _mode(policy: WPTPolicy, state: Latent) -> Tensor:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Means over episodes.
+    """The result of `diagnose`.
 
-    :param returns: of each
-    :param reward_error: mean absolute error a step of the reward head on filtered states
-    :param promises: by start
+    :param returns: the return of each episode
+    :param reward_error: mean absolute error of the reward head per step, on filtered states
+    :param promises: a row for each starting step, means over episodes
     """
 
     returns: list[float]
@@ -112,7 +112,7 @@ class Diagnosis:
 def diagnose(
     trained: Trained, episodes: int, seed: int, horizon: int, device: str = "auto"
 ) -> Diagnosis:
-    """Plays episodes with a trained model's actor and asks its networks about them.
+    """Play episodes with a trained model and compare its predictions with what it earns.
 
     :raises ValueError: an episode that is not longer than `horizon`
     """

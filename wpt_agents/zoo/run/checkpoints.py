@@ -255,7 +255,7 @@ class HeadStart(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         delay = getattr(self.model, "actor_delay", 0)
-        if delay and not self.path.exists() and getattr(self.model, "updates", 0) >= delay:
+        if delay and not self.path.exists() and getattr(self.model, "task_updates", 0) >= delay:
             self.model.save(self.path)
 
     def _on_step(self) -> bool:

@@ -155,7 +155,16 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effo
 def resume(run: Run, agent: Any, checkpoint: Checkpoint) -> None:
     """Restore what the model file does not hold, in the agent and in its environment."""
     checkpoint.restore(agent, run.folder)
-    go_to_episode(agent.env, agent.episodes)
+    go_to_episode(agent.env, first_episode(agent) + agent.episodes)
+
+
+def first_episode(agent: Any) -> int:
+    """Return the number of the first episode that was collected for the task.
+
+    Those before it were only begun, for the first images that retrieval compares.
+    """
+    looked = isinstance(agent, WPT) and agent.progress.retrieved_ids
+    return agent.retrieval_images - 1 if looked else 0
 
 
 @contextmanager

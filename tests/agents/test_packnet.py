@@ -1,5 +1,8 @@
 """PackNet: equal shares by magnitude, and earlier tasks that act bit-equal after later ones."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -100,6 +103,34 @@ def test_a_later_task_changes_only_free_weights_and_draws_a_new_critic():
     assert all((before[k] == after[k]).all() for k in frozen)
 
 
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+def test_a_copy_leaves_the_weights_of_earlier_tasks_alone(copied):
+    model = agent(ClockEnv(25)).learn(25)
+    model.next_task(ClockEnv(25))
+    other = copied(model)
+    other.set_env(ClockEnv(25))
+    before = actions(other.policy_of(0))
+    other.learn(25)
+    assert other.updates > model.updates
+    assert (actions(other.policy_of(0)) == before).all()
+
+
+def test_another_action_width_begins_a_new_sequence(tmp_path):
+    model = agent(ClockEnv(25), tasks=2).learn(25)
+    model.next_task(ClockEnv(25))
+    model.set_env(ClockEnv(25, actions=5))
+    assert model.progress.task == 0
+    model.learn(25)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "replay.zip")
+    loaded = PackNet.load(tmp_path / "model", env=ClockEnv(25, actions=5), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "replay.zip")
+    for one in (model, loaded):
+        one.learn(25, reset_num_timesteps=False)
+        one.next_task(ClockEnv(25, actions=5))
+    assert model.progress == loaded.progress and same(weights(model), weights(loaded))
+
+
 def test_freed_weights_are_drawn_again():
     model = agent().learn(25)
     model.next_task(DotEnv())
@@ -154,3 +185,5 @@ def test_a_sequence_that_is_over_and_another_action_width_are_refused():
     with pytest.raises(ValueError, match="no further task"):
         model.next_task(DotEnv())
     assert np.isfinite(actions(model.policy_of(1))).all()
+    with pytest.raises(ValueError, match="no policy of task 2 yet: pass a number from 0 to 1"):
+        model.policy_of(2)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 
 from wpt_agents.agents.base import Metrics
 from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords
@@ -216,7 +216,7 @@ class DrQv2Learner:
             target = td_target(batch.reward, batch.discount, next_q)
         q = policy.critic(embed, batch.action)
         value_loss = critic_loss(q, target)
-        descend(self.critic_optimizer, value_loss, "critic")
+        self.descend(self.critic_optimizer, value_loss, "critic")
         embed = embed.detach()  # the actor's loss does not train the encoder
         before_tanh = policy.actor.before_tanh(embed)
         action = noisy_action(before_tanh.tanh(), std, clip, generator)
@@ -224,7 +224,7 @@ class DrQv2Learner:
             loss = actor_loss(policy.critic(embed, action))
         if self.settings.pre_activation:
             loss = loss + self.settings.pre_activation * before_tanh.square().mean()
-        descend(self.actor_optimizer, loss, "actor")
+        self.descend(self.actor_optimizer, loss, "actor")
         ema_update(policy.target_critic, policy.critic, self.settings.tau)
         return {
             "train/critic_loss": value_loss.detach(),
@@ -232,6 +232,10 @@ class DrQv2Learner:
             "train/q": q.detach().mean(),
             "train/batch_reward": batch.reward.mean(),
         }
+
+    def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> None:
+        """Compute the gradients of a loss and take a step."""
+        descend(optimizer, loss, name)
 
 
 class DrQv2(FrameAgent, keywords=DrQv2Keywords):

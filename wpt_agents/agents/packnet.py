@@ -9,18 +9,20 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
+from math import inf
 from typing import Any, ClassVar
 
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from wpt_agents.agents.drqv2 import Critic, DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Policy
 from wpt_agents.agents.frame_agent import FrameProgress
 from wpt_agents.data.bars import shown
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.model.frames import orthogonal
+from wpt_agents.training.descent import take_step
 from wpt_agents.training.keywords import Stage, count, share
 from wpt_agents.training.randomness import Purpose
 
@@ -111,9 +113,9 @@ def _owner(name: str) -> str:
 
 
 class PackNetLearner(DrQv2Learner):
-    """The update of DrQ-v2 that changes no weight of another owner. Its Adam is new.
+    """The update of DrQ-v2 that changes no weight of another owner.
 
-    With moments of its own from before, Adam would move a weight whose gradient is zero.
+    With moments from before, Adam would move a weight whose gradient is zero. A new one does not.
 
     :param trains: the owner whose weights are trained: FREE, or a task that is being retrained
     """
@@ -122,20 +124,17 @@ class PackNetLearner(DrQv2Learner):
 
     def __init__(self, policy: PackNetPolicy, settings: DrQv2Keywords, trains: int = FREE) -> None:
         super().__init__(policy, settings)
-        self.hooks = [
-            weight.register_hook(partial(_masked, policy, name, trains))
-            for name, weight in policy.managed()
-        ]
+        self.trains = trains
 
-    def close(self) -> None:
-        """Stop masking gradients, before another learner of the same policy is made."""
-        for hook in self.hooks:
-            hook.remove()
-
-
-def _masked(policy: PackNetPolicy, name: str, trains: int, gradient: Tensor) -> Tensor:
-    # Adam moves no weight whose gradient was always zero.
-    return gradient * (policy.owner(name) == trains)
+    def descend(self, optimizer: Optimizer, loss: Tensor, name: str) -> None:
+        """Take a step whose gradient is zero at the weights of all other owners."""
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        # Not by hooks on the weights: copies of a parameter lose them.
+        for layer, weight in self.policy.managed():
+            if weight.grad is not None:
+                weight.grad.mul_(self.policy.owner(layer) == self.trains)
+        take_step(optimizer, loss, name, inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,13 +182,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
 
     def make_learner(self) -> PackNetLearner:
         """Make the optimisers, and mask the gradients of weights that earlier tasks own."""
-        return self._learner_of(FREE)
-
-    def _learner_of(self, trains: int) -> PackNetLearner:
-        before = getattr(self, "learner", None)
-        if isinstance(before, PackNetLearner):
-            before.close()
-        return PackNetLearner(self.policy, self.hyperparameters, trains)
+        return PackNetLearner(self.policy, self.hyperparameters)
 
     def restore(self, contents: Mapping[str, Any], *args: Any) -> None:
         """Take over a model file; in a later task biases and layer norms are frozen."""
@@ -200,8 +193,22 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         super().restore(contents, *args)
 
     def policy_of(self, task: int) -> PackNetPolicy:
-        """Return the policy of a task up to the present one, as it was when the task ended."""
+        """Return the policy of a task up to the present one, as it was when the task ended.
+
+        :raises ValueError: a task that has not begun
+        """
+        if not 0 <= task <= self.progress.task:
+            raise ValueError(
+                f"There is no policy of task {task} yet: pass a number from 0 to "
+                f"{self.progress.task}, the present task"
+            )
         return self.policy if task == self.progress.task else self.policy.as_task(task)
+
+    def reset_task(self) -> None:
+        """Forget the whole sequence: episodes, all networks and the owners of their weights."""
+        self.progress.task = 0
+        self.progress.updates_before = self.updates
+        super().reset_task()
 
     def next_task(self, env: Any, progress_bar: bool = False) -> None:
         """Prune and retrain the weights of the present task, then begin another one.
@@ -235,7 +242,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
 
     def _retrain(self, progress_bar: bool) -> None:
         """Train the weights that the present task keeps, from its replay."""
-        self.learner = self._learner_of(self.progress.task)
+        self.learner = PackNetLearner(self.policy, self.hyperparameters, self.progress.task)
         made = self.updates - self.progress.updates_before
         updates = round(made * self.hyperparameters.retrain)
         for _ in shown(range(updates), updates, "retrain", progress_bar):

@@ -50,6 +50,27 @@ def test_targets_are_copied_and_rewards_measured_every_few_updates():
     assert model.updates == 5 and model.progress.target_scale == 4.0
 
 
+def test_the_encoder_learns_first_in_every_task():
+    model = agent(ClockEnv(), train_freq="episode", learning_starts=0, update_every=7)
+    model.learn(14)
+    model.reset_task()
+    model.learn(7)
+    assert model.updates == 3 and model.progress.scale == 4.0
+
+
+def test_value_functions_learn_from_the_last_steps_of_episodes_that_terminate(monkeypatch):
+    model = agent(ClockEnv(terminates=True), train_freq="episode", batch_size=64, update_every=7)
+    seen, update = [], model.learner.update
+
+    def recorded(batch, *args):
+        seen.append(batch.image[:, -1, 0, 0, 0])
+        return update(batch, *args)
+
+    monkeypatch.setattr(model.learner, "update", recorded)
+    model.learn(21)
+    assert set(torch.cat(seen).tolist()) == {0, 1, 2, 3, 4, 5, 6}  # of seven steps
+
+
 def renamed(model, old, new):
     return {k.replace(old, new): w for k, w in weights(model, old).items()}
 

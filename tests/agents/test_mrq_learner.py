@@ -146,11 +146,8 @@ class Reference:
             z_sa = pair(self.f, z, batch.action)
         errors = [(q - y).abs() for q in values(self.q, z_sa)]
         priority = torch.maximum(*errors).detach().clamp_min(1) ** 0.4
-        losses = [
-            torch.where(e < 1, e**2 / 2, (e.clamp_min(1) ** 1.4 - 1) / 1.4 + 0.5).mean()
-            for e in errors
-        ]
-        self.adams[1].descend(sum(losses) / 2 / priority.mean())
+        huber = [torch.where(e < 1, e**2 / 2, e - 0.5) for e in errors]
+        self.adams[1].descend(sum((priority * loss).mean() for loss in huber) / 2 / priority.mean())
         u = act(self.mu, z)
         q = sum(values(self.q, pair(self.f, z, u.tanh()))) / 2
         self.adams[2].descend(-q.mean() + 1e-5 * (u**2).mean())

@@ -59,6 +59,18 @@ def test_nothing_is_bootstrapped_from_behind_a_terminal_state():
     assert rows[2][1] == 6.25  # the last reward counts all the same
 
 
+def test_the_last_steps_are_starts_where_the_episode_terminated_and_they_are_asked_for():
+    rng = np.random.default_rng(0)
+    both = [
+        {s: row[1:3] for s, row in by_start(draw_transitions(*shape, rng, tails=True)).items()}
+        for shape in (([episode(terminated=end)], 200, 3, 0.5, 2) for end in (True, False))
+    ]
+    full = {0: (2.75, 0.125), 1: (4.5, 0.125)}
+    # r_3 + .5 r_4 = 4 + 2.5 and r_4 = 5, behind which there is nothing
+    assert both[0] == full | {2: (6.25, 0.0), 3: (6.5, 0.0), 4: (5.0, 0.0)}
+    assert both[1] == full | {2: (6.25, 0.125)}
+
+
 def test_an_episode_shorter_than_n_steps_is_drawn_whole():
     assert by_start(drawn([episode(2)], 3)) == {0: ([0, 0, 0], 2.0, 0.25, [0, 1, 2])}
 

@@ -83,20 +83,20 @@ def test_the_scaled_target_by_hand():
 
 def test_the_value_loss_by_hand():
     q, target = torch.tensor([[1.5, 5.0], [1.0, 2.0]]), torch.tensor([1.0, 1.0])
-    # errors .5 4 | 0 1: .125, (4^1.4 - 1) / 1.4 + .5, 0, .5; the largest of a row, .5 > 1 and 4
-    expected = (0.125 + (4**1.4 - 1) / 1.4 + 0.5 + 0 + 0.5) / 4 / ((1 + 4**0.4) / 2)
+    # errors .5 4 | 0 1: Huber's losses .125 3.5 | 0 .5; the largest of a row, .5 and 4, weighs it
+    expected = (1 * (0.125 + 0) + 4**0.4 * (3.5 + 0.5)) / 4 / ((1 + 4**0.4) / 2)
     assert value_loss(q, target).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_value_loss_has_the_gradient_of_hubers_loss_on_prioritised_draws():
-    error = torch.tensor([0.3, -2.0, 5.0, 0.0])
-    q = torch.stack([error, error]).requires_grad_()
+    error = torch.tensor([[0.3, -2.0, 5.0, 0.0], [0.1, 0.5, -9.0, 3.0]])
+    q = error.clone().requires_grad_()
     value_loss(q, torch.zeros(4)).backward()
-    priority = error.abs().clamp_min(1) ** 0.4
+    priority = error.abs().amax(0).clamp_min(1) ** 0.4  # the larger error of both, at least 1
     huber = error.clamp(-1, 1)  # the gradient of Huber's loss
     # the mean over draws with probability priority / sum, in place of 1 / 4 each; two critics
     expected = priority / priority.sum() * huber / 2
-    torch.testing.assert_close(q.grad[0], expected)
+    torch.testing.assert_close(q.grad, expected)
 
 
 def test_the_actors_loss_by_hand():

@@ -173,17 +173,25 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         """Return what stands for the episodes' images in a batch; None for the images."""
         return None
 
-    def draw(self, replay: ReplayBuffer, size: int, n_steps: int, stream: int = 0) -> Transitions:
+    def draw(
+        self,
+        replay: ReplayBuffer,
+        size: int,
+        n_steps: int,
+        stream: int = 0,
+        tails: bool = False,
+    ) -> Transitions:
         """Draw the batch of the next update from some episodes; its images are shifted at random.
 
         :param stream: another number for each batch of the same update
+        :param tails: of `draw_transitions`
         """
         rng = self.batch_rng(stream)
         settings = self.hyperparameters
         shape = size, n_steps, settings.gamma, self.policy.action_dim
         seen = self.seen(replay)
         pad = settings.pad if seen is None else 0  # features cannot be shifted
-        batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen)
+        batch = draw_transitions(replay.trajectories, *shape, rng, pad=pad, seen=seen, tails=tails)
         return batch.to(self.device)
 
     def batch_rng(self, stream: int) -> np.random.Generator:

@@ -5,7 +5,7 @@ Source: https://arxiv.org/abs/2501.16142. It came after the paper and is not amo
 
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Any, ClassVar
 
@@ -72,10 +72,12 @@ class MRQProgress(FrameProgress):
 
     :ivar scale: mean absolute reward when the targets were last copied
     :ivar target_scale: that of the copy before
+    :ivar updates_before: updates that were made for earlier tasks
     """
 
     scale: float = 1.0
     target_scale: float = 0.0
+    updates_before: int = field(default=0, metadata={"earlier": 0})
 
 
 class MRQPolicy(FramePolicy):
@@ -216,9 +218,9 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
     def update(self, metrics: Metrics) -> None:
         """Make one update on the replay. Once in `sync_every` updates, the encoder's come first."""
         settings = self.hyperparameters
-        if self.updates % settings.sync_every == 0:
+        if (self.updates - self.progress.updates_before) % settings.sync_every == 0:
             metrics["train/encoder_loss"].append(self._update_encoder())
-        batch = self.draw(self.replay_buffer, settings.batch_size, settings.n_steps)
+        batch = self.draw(self.replay_buffer, settings.batch_size, settings.n_steps, tails=True)
         generator = self.streams.torch(Purpose.UPDATE, self.updates, self.device)
         scales = self.progress.scale, self.progress.target_scale
         for name, value in self.learner.update(batch, *scales, generator).items():
@@ -256,4 +258,5 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
     def reset_task(self) -> None:
         """Forget the task: episodes, all networks, and the scale of the rewards."""
         self.progress.reset("scale", "target_scale")
+        self.progress.updates_before = self.updates  # the encoder's come first again
         super().reset_task()

@@ -125,8 +125,9 @@ def draw_transitions(
     pad: int = 0,
     frames: int = 3,
     seen: Sequence[np.ndarray] | None = None,
+    tails: bool = False,
 ) -> Transitions:
-    """Draws transitions whose n steps lie inside one episode, every start equally likely.
+    """Draw transitions whose n steps lie inside one episode, every start equally likely.
 
     Before an episode's third image its first one stands for those that are missing, as in acting.
     Episodes shorter than n steps are drawn whole. DrQ-v2 draws an episode and then a start in it,
@@ -138,11 +139,16 @@ def draw_transitions(
     :param pad: pixels by which `image` and `next_image` are shifted at most, independently
     :param frames: F, the images in a stack
     :param seen: for each trajectory what stands for its images, (T + 1, ...), such as features
+    :param tails: whether the last n - 1 steps of an episode that terminated are starts, too: no
+        rewards follow its end, so sums of fewer rewards are complete there
     :raises ValueError: there is no trajectory
     """
     if not trajectories:
         raise ValueError("There are no episodes to draw transitions from; collect some first")
-    starts = np.cumsum([max(len(t) - n_steps, 0) + 1 for t in trajectories])
+    numbers = [
+        len(t) if tails and t.terminated else max(len(t) - n_steps, 0) + 1 for t in trajectories
+    ]
+    starts = np.cumsum(numbers)
     drawn = rng.integers(starts[-1], size=size)
     chosen = np.searchsorted(starts, drawn, side="right")
     begin = drawn - np.concatenate([[0], starts])[chosen]

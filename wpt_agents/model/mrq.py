@@ -184,20 +184,20 @@ def scaled_target(
 
 
 def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
-    """The prioritised approximation loss: `δ²/2` up to `|δ| = 1`, `|δ|^(1+α) / (1+α)` beyond.
+    """Huber's loss, each row weighing `p = max(δ_1, δ_2, 1)^α` over the mean p; δ are the errors.
 
-    MR.Q draws transitions in proportion to `max(|δ|, 1)^α` and takes Huber's loss. On uniform draws
-    this loss has the same expected gradient up to its scale (https://arxiv.org/abs/2007.06049), and
-    there are no priorities to keep.
+    MR.Q draws transitions in proportion to p, the larger error of both value functions. On uniform
+    draws these weights give the same expected gradient, and there are no priorities to keep
+    (https://arxiv.org/abs/2007.06049).
 
     :param q: (2, N)
     :param target: (N,); no gradient reaches it
     """
-    error = (q - target.detach()).abs()  # α = 0.4 and the 1 are MR.Q's, of its replay
-    beyond = (error.clamp_min(1) ** (1 + alpha) - 1) / (1 + alpha) + 0.5  # continuous at 1
-    loss = torch.where(error < 1, 0.5 * error.square(), beyond)
-    normaliser = error.detach().amax(0).clamp_min(1).pow(alpha).mean()
-    return loss.mean() / normaliser
+    target = target.detach().expand_as(q)
+    error = (q.detach() - target).abs()
+    priority = error.amax(0).clamp_min(1).pow(alpha)  # α = 0.4 and the 1 are MR.Q's, of its replay
+    loss = F.smooth_l1_loss(q, target, reduction="none")
+    return (priority * loss).mean() / priority.mean()
 
 
 def actor_loss(q: Tensor, before_tanh: Tensor, weight: float = 1e-5) -> Tensor:

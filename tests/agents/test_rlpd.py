@@ -68,6 +68,16 @@ def test_offline_rewards_are_read_by_the_true_label_alone(label, reads, dataset)
     assert same(*learned) != reads
 
 
+@pytest.mark.parametrize(("label", "known"), [("true", True), ("zero", False)])
+def test_terminations_of_offline_data_are_known_with_their_rewards_alone(label, known, tmp_path):
+    with TrajectoryDataset.create(tmp_path / "data") as data:
+        one = recorded(embodiment="dot", terminated=True)
+        data.append(replace(one, reward=np.ones(len(one))))
+    model = agent(ClockEnv(), data, label=label).learn(7)
+    batch = model.draw(model.retrieved, 100, 1)
+    assert set(batch.discount.tolist()) == ({0.0} if known else set()) | {np.float32(0.99)}
+
+
 def test_half_of_each_batch_is_offline_and_online_rewards_are_kept(dataset, monkeypatch):
     model = agent(ClockEnv(), dataset(), label="zero")
     seen, update = [], model.learner.update

@@ -152,8 +152,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
                     f"The dataset {self.dataset.path} holds trajectories without rewards, which "
                     "label='true' needs: pass label='zero' or label='optimistic'"
                 )
-            kept = trajectory if self.offline_rewards else replace(trajectory, reward=None)
-            self.retrieved.add(kept)
+            if not self.offline_rewards:
+                # Another task may end elsewhere, so terminations count as little as rewards do.
+                trajectory = replace(trajectory, reward=None, terminated=False)
+            self.retrieved.add(trajectory)
 
     def _related(self) -> list[int]:
         assert self.dataset is not None and self.env is not None

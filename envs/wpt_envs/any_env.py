@@ -1,4 +1,4 @@
-"""The same observation, repeat and padding around any Gymnasium environment that renders."""
+"""`pixels`: image observations for any Gymnasium environment that renders."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +27,13 @@ def pixels(
     state_in_info: bool = False,
     render_size: int | None = None,
 ) -> gym.Env:
-    """Show `env` by its own `render()`, by an entry of its observations, or by our renderer.
+    """Wrap an environment so that its observations are images of (image_size, image_size, 3) uint8.
+
+    The images come from its own `render()`, from an entry of its Dict observations (`image_key`),
+    or from this package's renderer of MuJoCo simulations (`rendering`).
 
     :param env: any Gymnasium environment
-    :param image_size: side of the observed image, to which pictures are shrunk
+    :param image_size: side of the observed image, to which larger images are shrunk
     :param action_repeat: steps of `env` in one step, their rewards summed
     :param pad_action_to: width to which actions are padded
     :param rendering: `exact`, `near` or `fast` draws a MuJoCo environment several times quicker

@@ -1,9 +1,9 @@
-"""Other people's data as trajectories: one module a format, read one episode at a time.
+"""Readers of other data formats: one module for each format, which reads one episode at a time.
 
 Example::
 
     dataset = TrajectoryDataset.from_npz("exorl/walker", "walker-store", embodiment="walker")
 
-Formats differ in when an action stands (`wpt_agents.data.trajectory` has ours); each reader says
-which convention it converts from.
+Formats differ in which action belongs to which image. Each reader documents its format's timing,
+and converts it to that of `wpt_agents.data.trajectory`.
 """

@@ -1,4 +1,4 @@
-"""What every reader of a foreign format shares: its options, image and action conversion."""
+"""The base of all readers of other data formats: options, and conversion of images and actions."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -14,16 +14,16 @@ from wpt_agents.data.units import both_limits, rescaled
 
 
 class Episodes(ABC):
-    """Episodes in a fixed order, each read and converted when it is asked for.
+    """Episodes in a fixed order, each read and converted when it is accessed.
 
-    An episode of a single image holds no action and is left out with a warning.
+    An episode of a single image contains no action and is left out with a warning.
 
     :param image_size: height and width to resize to
     :param rewards: whether to keep the rewards; pre-training needs none
     :param embodiment: the robot's name, for all episodes
     :param task: the task, for all episodes
-    :param image_key: the name of the images (or camera), if the format's own is not there or there
-        are several
+    :param image_key: the name of the images or of the camera; required if the format's usual name
+        is missing or if there are several
     :param action_key: the name of the actions, or several names whose arrays are concatenated in
         that order; in a string, they are separated by commas
     :param done_key: the name of the flags at which an episode ends, or of the flag that its end is

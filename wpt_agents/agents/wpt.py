@@ -278,7 +278,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         progress.task_updates += 1
 
     def begin_residual(self) -> None:
-        """Copy the actor: the imitator, by the difference to which the actor corrects the clone."""
+        """Copy the actor: its difference to this imitator is added to the prior actor's action."""
         policy = self.policy
         if policy.imitator is None:
             policy.imitator = deepcopy(policy.actor)

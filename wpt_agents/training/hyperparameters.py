@@ -282,9 +282,9 @@ class Hyperparameters(Keywords):
     )
     residual: bool = switch(
         False,
-        "act by the prior actor's action plus the difference between the actor and an actor that "
-        "only imitates the prior actor: before anything is learned in imagination the prior actor "
-        "acts, not an imitation of it from latent states; not in the paper",
+        "act by the prior actor's action plus the difference between the actor and a copy of it "
+        "that goes on imitating the prior actor, so that learning begins at the prior actor itself "
+        "and not at an imitation of it from latent states; not in the paper",
         Stage.ACTING,
     )
     episode_length: int | None = count(

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
     dream = model.policy.dream(Latent(*state), 4, generator())
     ensemble = model.policy.curiosity
     ensemble.scale.see(torch.tensor(1.0))
-    model.learner.arrival = torch.arange(-1.0, 5.0)
+    model.learner.paid = SimpleNamespace(reward=torch.arange(-1.0, 5.0))
     reward = model.learner.imagined_reward(dream, torch.arange(1, 6))
     assert reward.shape == (5, 4) and (reward[:, 1:] > 0).all()
     assert reward[:, 0].tolist() == [0, 1, 2, 3, 4]
@@ -191,14 +192,14 @@ def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
 def test_the_tasks_reward_teaches_nothing(kind):
     batch, outcomes = batch_of(recorded(8), recorded(8, seed=1)), []
     for reward in (0.0, 1000.0):
-        model = explorer(kind)
+        model = explorer(kind, repval_scale=1.0)
         paid = replace(
             batch,
             reward=torch.full_like(batch.reward, reward),
             reward_known=torch.ones_like(batch.is_first),
         )
-        _, metrics = model.learner.update_world_model(paid, generator(), learn_reward=True)
-        assert metrics["explore/surprise"] > 0
+        metrics = model.learner.update(paid, generator())
+        assert metrics["explore/surprise"] > 0 and metrics["train/replay_value_loss"] > 0
         outcomes.append(weights(model))
     assert same(*outcomes)
 

@@ -56,6 +56,8 @@ EXPLORE: Mapping[str, Any] = {
 class CuriousLearner(Learner):
     """A learner whose reward is curiosity; `policy.curiosity` is one more network to train."""
 
+    paid: Batch  # the batch of the present update, with curiosity in place of the task's rewards
+
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
         assert isinstance(policy.curiosity, nn.Module)
@@ -67,6 +69,10 @@ class CuriousLearner(Learner):
         super().configure(hyperparameters)
         rate = self.hyperparameters.value("learning_rate")
         self.set_rate(self.curiosity_optimizer, float(rate))
+
+    def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
+        """DreamerV3's replay value loss, on returns of curiosity: the critic's value is theirs."""
+        return super().replay_value_loss(post, self.paid)
 
 
 class ICMLearner(CuriousLearner):
@@ -93,7 +99,7 @@ class ICMLearner(CuriousLearner):
         known = torch.zeros_like(batch.is_first)
         reward[:, 1:] = icm.scale(surprise.detach())
         known[:, 1:] = within
-        batch = replace(batch, reward=reward, reward_known=known)
+        batch = self.paid = replace(batch, reward=reward, reward_known=known)
         post, metrics = super().update_world_model(batch, generator, learn_reward, states_loss)
         return post, metrics | {"explore/surprise": surprise.detach().mean()}
 
@@ -128,8 +134,11 @@ class Plan2ExploreLearner(CuriousLearner):
         self.descend(self.curiosity_optimizer, loss, "curiosity")
         surprise = disagreement(prediction.detach())  # the reward must not train the ensemble
         ensemble.scale.see(surprise[within])
-        paid = ensemble.scale(surprise) * within
-        self.arrival = torch.cat([torch.zeros_like(paid[:, :1]), paid], 1).flatten()
+        reward = torch.zeros_like(batch.reward)
+        known = torch.zeros_like(batch.is_first)
+        reward[:, 1:] = ensemble.scale(surprise) * within
+        known[:, 1:] = within
+        self.paid = replace(batch, reward=reward, reward_known=known)
         return post, metrics | {"explore/surprise": surprise[within].mean()}
 
     def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
@@ -139,7 +148,7 @@ class Plan2ExploreLearner(CuriousLearner):
         feat = dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        arrival = self.arrival[starts]
+        arrival = self.paid.reward.flatten()[starts]
         assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
         return torch.cat([arrival[:, None], surprise], 1)
 

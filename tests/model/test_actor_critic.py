@@ -1,5 +1,6 @@
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -303,6 +304,24 @@ def test_an_update_trains_every_network_but_the_clone(precision):
     for name, part in parts.items():
         assert not any(map(torch.equal, before[name], part.parameters())), name
     assert all(map(torch.equal, clone, model.policy.prior_actor.parameters()))
+
+
+def test_reinforce_casts_weights_anew_after_its_dreams_without_gradient(monkeypatch):
+    """In one context, torch before 2.11 would reuse casts that have no gradient."""
+    model = filled(actor_grad="reinforce", precision="bf16")
+    learner = model.learner
+    called = []
+
+    def noted(name, plain, *args):
+        called.append(name)
+        return plain(*args)
+
+    for name in ("autocast", "imagine", "actor_loss"):
+        plain = getattr(learner, name)
+        monkeypatch.setattr(learner, name, partial(noted, name, plain))
+    model.update(defaultdict(list))
+    dreams = called.index("imagine")
+    assert called[dreams : dreams + 3] == ["imagine", "autocast", "actor_loss"]
 
 
 def test_rewards_teach_the_reward_head_and_leave_the_world_model_alone():

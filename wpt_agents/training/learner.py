@@ -192,11 +192,13 @@ class Learner(WorldModelLearner):
         policy = self.policy
         settings = self.hyperparameters
         through_dream = settings.actor_grad == "dynamics" and not head_start
+        with self.autocast(), torch.set_grad_enabled(through_dream):
+            imagined = self.imagine(start, starts, generator)
+        dream, reward, value, returns, goes_on = imagined
+        spread, scale = self.return_scale(returns)
+        # In a new context: torch before 2.11 would use the weights again that it has cast above,
+        # without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
         with self.autocast():
-            with torch.set_grad_enabled(through_dream):
-                imagined = self.imagine(start, starts, generator)
-            dream, reward, value, returns, goes_on = imagined
-            spread, scale = self.return_scale(returns)
             loss = self.actor_loss(imagined, scale)
         terms = [] if head_start else [loss]
         terms += [] if imitation is None else [imitation]

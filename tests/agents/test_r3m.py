@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from debug_agent import ClockEnv, recorded, same, weights
+from plain import Adam, parameters
 
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.data.dataset import TrajectoryDataset
@@ -61,6 +63,48 @@ def test_pre_training_aligns_held_out_clips(tmp_path):
     settings = SETTINGS | {"learning_rate": 1e-3}
     before, after = (R3M.pretrain(data, steps=steps, **settings) for steps in (0, 150))
     assert share(before) < 0.7 and share(after) > 0.8
+
+
+def plain_features(w, image):
+    """The features of single images (N, 64, 64, 3), written out."""
+    x = image.permute(0, 3, 1, 2) / 255 - 0.5
+    for i, stride in enumerate((2, 1, 1, 1)):
+        x = F.conv2d(x, w[f"body.0.layers.{i}.weight"], w[f"body.0.layers.{i}.bias"], stride=stride)
+        x = x * (x > 0)
+    return x.reshape(len(x), -1) @ w["body.1.weight"].T + w["body.1.bias"]
+
+
+def plain_loss(w, clips, others):
+    """R3M's loss without language, written out."""
+    z = [plain_features(w, clips[:, k]) for k in range(3)]
+
+    def likeness(one, other):
+        return torch.exp(-((one - other) ** 2).sum(1).sqrt())
+
+    loss, far = 0.0, likeness(z[0], z[2])
+    for near, anchor in ((likeness(z[1], z[2]), z[2]), (likeness(z[0], z[1]), z[0])):
+        elsewhere = sum(likeness(anchor, anchor[row]) for row in others)
+        loss = loss - torch.log(near / (near + far + elsewhere)).mean() / 2
+    every = torch.cat(z)
+    return loss + 1e-5 * (every.abs().sum(1).mean() + (every**2).sum(1).sqrt().mean())
+
+
+def test_three_updates_of_pre_training_equal_a_plain_second_implementation():
+    model = R3M("CnnPolicy", ClockEnv(), **SETTINGS)
+    w = parameters(model.policy.encoder)
+    adam, others = Adam(1e-4, w), torch.tensor([[1, 2, 3, 0], [2, 3, 0, 1]])
+    actor = weights(model, "actor", "critic")
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        clips = torch.from_numpy(rng.uniform(0, 255, (4, 3, 64, 64, 3)).astype(np.float32))
+        model.learner.pretrain(clips, others)
+        adam.descend(plain_loss(w, clips, others))
+    for name, weight in model.policy.encoder.named_parameters():
+        off = (weight - w[name]).abs() > 1e-5  # a tenth of a step
+        # The loss looks at differences of features, so the last bias has hardly a gradient, whose
+        # rounding Adam enlarges to a whole step.
+        assert off.float().mean() <= (0.02 if name == "body.1.bias" else 0.0), name
+    assert same(actor, weights(model, "actor", "critic"))
 
 
 def test_pre_training_continues_exactly_from_its_model_file(dataset, tmp_path):
@@ -122,18 +166,27 @@ def test_a_loaded_model_goes_on_exactly(dataset, tmp_path):
     assert same(weights(whole), weights(loaded))
 
 
-def test_the_authors_weights_are_taken_and_must_fit_the_backbone(tmp_path):
+def test_the_authors_weights_are_taken_and_must_fit_the_backbone(dataset, tmp_path):
     from wpt_agents.model.resnet import ResNet
 
     torch.manual_seed(3)
     named = {f"module.convnet.{k}": w for k, w in ResNet(18).state_dict().items()}
-    torch.save({"r3m": named}, tmp_path / "r3m_18.pt")
-    model = R3M("CnnPolicy", ClockEnv(), backbone="resnet18", **SETTINGS)
-    model.load_weights(tmp_path / "r3m_18.pt")
-    assert torch.equal(model.policy.encoder.body.conv1.weight, named["module.convnet.conv1.weight"])
-    assert model.policy.encoder.embed_dim == 3 * 512
+    file = tmp_path / "r3m_18.pt"
+    torch.save({"r3m": named}, file)
+    settings = SETTINGS | {"backbone": "resnet18", "weights": str(file)}
+    model = R3M.pretrain(dataset, ClockEnv(), steps=3, run_dir=tmp_path / "run", **settings)
+    file.unlink()
+    loaded = R3M.load(tmp_path / "run" / "model.zip", device="cpu")
+    for one in (model, loaded):
+        assert one.progress.pretrain_steps == 0 and one.policy.encoder.embed_dim == 3 * 512
+        body = one.policy.encoder.body.state_dict()
+        assert all(torch.equal(w, named[f"module.convnet.{k}"]) for k, w in body.items())
+    del named["module.convnet.layer4.1.bn2.weight"]
+    torch.save({"r3m": named}, file)
+    with pytest.raises(ValueError, match=r"r3m_18\.pt does not fit backbone='resnet18'"):
+        model.load_weights(file)
     with pytest.raises(ValueError, match="does not fit backbone='conv'"):
-        R3M("CnnPolicy", ClockEnv(), **SETTINGS).load_weights(tmp_path / "r3m_18.pt")
+        R3M("CnnPolicy", ClockEnv(), **SETTINGS, weights=str(file))
 
 
 def test_differences_of_frames_are_refused():

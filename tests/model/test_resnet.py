@@ -105,6 +105,23 @@ def test_the_outputs_are_those_of_the_published_layout(depth):
     torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4 * theirs.abs().max().item())
 
 
+@pytest.mark.parametrize("depth", [18, 34, 50])
+def test_it_is_the_network_of_torchvision(depth):
+    reason = "torchvision is not among our dependencies; the test above has its layout written out"
+    models = pytest.importorskip("torchvision.models", reason=reason)
+    weights, network = random_weights(depth), ResNet(depth)
+    network.load_state_dict(weights)
+    theirs = getattr(models, f"resnet{depth}")(weights=None).eval()
+    theirs.fc = torch.nn.Identity()
+    theirs.load_state_dict(weights)
+    image = torch.randint(0, 256, (2, 224, 224, 3), dtype=torch.uint8)
+    mean, std = (torch.tensor(x).view(3, 1, 1) for x in (MEAN, STD))
+    with torch.no_grad():
+        ours = network(image)
+        expected = theirs((image.permute(0, 3, 1, 2) / 255 - mean) / std)
+    torch.testing.assert_close(ours, expected, rtol=1e-3, atol=1e-4 * expected.abs().max().item())
+
+
 def test_small_images_are_resized_not_cropped():
     network = ResNet(18)
     image = torch.full((1, 64, 64, 3), 200, dtype=torch.uint8)

@@ -34,7 +34,7 @@ from wpt_agents.model.time_contrastive import (
     random_crop,
 )
 from wpt_agents.training.descent import descend
-from wpt_agents.training.keywords import Stage, choice, count
+from wpt_agents.training.keywords import Stage, choice, count, keyword, must
 from wpt_agents.training.pretraining import Callback, Pretraining
 from wpt_agents.training.randomness import Purpose
 
@@ -118,6 +118,14 @@ class R3MKeywords(DrQv2Keywords):
 
     backbone: str = choice("conv", BACKBONES, "the encoder of single images", Stage.SIZE)
     clips: int = count(16, "clips in a batch of pre-training", Stage.PRETRAINING, least=2)
+    weights: str | None = keyword(
+        None,
+        must("the path of a file", lambda value: isinstance(value, str)),
+        "file of R3M's authors, such as r3m_18.pt, that the encoder is read from when the agent is "
+        "made; `pretrain` then makes no updates. `backbone` must fit the file. A model file holds "
+        "the network itself and does not need it",
+        Stage.SIZE,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -144,9 +152,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         model.set_env("wpt/dmc-walker-run-v0")
         model.learn(75_000)
 
-    `model.load_weights("r3m_18.pt")` of an agent with `backbone="resnet18"` loads the network that
-    R3M's authors publish. There is no augmentation, so each image is encoded once, and its features
-    are stored with the episode.
+    `R3M(..., backbone="resnet18", weights="r3m_18.pt")` has the network that R3M's authors publish.
+    There is no augmentation, so each image is encoded once, and its features are stored with the
+    episode.
 
     :param policy: "CnnPolicy"
     """
@@ -164,6 +172,17 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
     def make_learner(self) -> R3MLearner:
         """Make the optimisers."""
         return R3MLearner(self.policy, self.hyperparameters)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.hyperparameters.weights is not None:
+            self.load_weights(self.hyperparameters.weights)
+
+    def description(self) -> dict[str, Any]:
+        """Return what a model file says of this agent besides its tensors."""
+        described = super().description()
+        described["hyperparameters"]["weights"] = None  # the encoder is among the tensors
+        return described
 
     def load_weights(self, path: str | os.PathLike[str]) -> None:
         """Load the encoder's weights from a file that R3M's authors publish, such as `r3m_18.pt`.
@@ -219,7 +238,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
 
         :param dataset: what the keyword `dataset` takes
         :param env: the environment to continue with, if known
-        :param steps: number of updates
+        :param steps: number of updates; none are made with `weights`
         :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
             on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
             If a model is there, training continues from it
@@ -237,8 +256,12 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         folder = Path(run_dir) if run_dir is not None else None
         if folder is not None and (folder / "model.zip").exists():
             model.restore(*read_model(folder / "model.zip"), (*cls.shape_keywords, "clips"))
-        with Pretraining(model, steps, folder, callback) as run:
-            model._pretrain(steps, run, progress_bar)
+        if model.hyperparameters.weights is None:
+            with Pretraining(model, steps, folder, callback) as run:
+                model._pretrain(steps, run, progress_bar)
+        elif folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            model.save(folder / "model.zip")
         if env is not None:
             model.set_env(env)
         return model

@@ -78,6 +78,9 @@ def test_the_clone_learns_from_the_robots_trajectories_and_is_offered_as_prior(d
     action, _ = model.prior.predict(DotEnv().reset(seed=0)[0])
     assert action.shape == (2,)
     assert all(t.reward is None for t in model.retrieved.trajectories)
+    for name in ("bc_steps", "num_retrieve"):
+        with pytest.raises(ValueError, match=r"the clone is trained; call reset_task\(\) first"):
+            setattr(model, name, 2)
 
 
 def test_a_loaded_model_goes_on_exactly_without_cloning_again(dataset, tmp_path, monkeypatch):

@@ -129,6 +129,20 @@ def test_data_that_are_set_later_take_the_place_of_those_that_were_chosen(datase
     assert {t.reward[0] for t in model.retrieved.trajectories} == {2.0}
 
 
+def test_the_number_of_trajectories_is_fixed_once_they_are_chosen(dataset, tmp_path):
+    data = dataset()
+    model = agent(ClockEnv(), data).learn(7)
+    model.save(tmp_path / "model")
+    loaded = RLPD.load(tmp_path / "model", dataset=data, device="cpu")
+    for one in (model, loaded):
+        with pytest.raises(ValueError, match=r"data are chosen; call reset_task\(\) first"):
+            one.num_retrieve = 2
+    loaded.set_dataset(dataset("other", reward=1.0))
+    loaded.num_retrieve = 2
+    loaded.set_env(ClockEnv())
+    assert len(loaded.learn(7).retrieved_ids) == 2
+
+
 def test_images_of_another_size_are_refused_before_anything_is_collected(tmp_path):
     one = recorded(embodiment="dot")
     with TrajectoryDataset.create(tmp_path / "wide", image_size=128) as wide:

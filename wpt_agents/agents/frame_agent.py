@@ -157,6 +157,13 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
                 trajectory = replace(trajectory, reward=None, terminated=False)
             self.retrieved.add(trajectory)
 
+    @property
+    def chosen(self) -> bool:
+        """Whether offline data of the present dataset are chosen, read or not."""
+        progress = self.progress
+        other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
+        return bool(progress.retrieved_ids) and not other
+
     def _related(self) -> list[int]:
         assert self.dataset is not None and self.env is not None
         settings, task = self.hyperparameters, self.hyperparameters.task
@@ -213,7 +220,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""
-        if stage is Stage.RETRIEVAL and self.retrieved is not None:
+        if stage is Stage.RETRIEVAL and self.chosen:
             return "the offline data are chosen; call reset_task() first"
         return super().too_late(stage)
 

@@ -105,6 +105,12 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         self.policy.prior_actor.load_state_dict(trained.state_dict())
         self.progress.cloned = True
 
+    def too_late(self, stage: Stage) -> str | None:
+        """Return the remedy if keywords of this stage can no longer take effect, else None."""
+        if stage in (Stage.RETRIEVAL, Stage.CLONING) and self.progress.cloned:
+            return "the clone is trained; call reset_task() first"
+        return super().too_late(stage)
+
     @property
     def prior(self) -> PriorPolicy | None:
         """The clone, with `predict`; None before it is trained."""

@@ -92,12 +92,16 @@ def test_sb3_evaluates_it_and_callbacks_see_and_stop_it():
     assert 0 < mean < 25 and np.isfinite(std)
 
 
-def test_a_loaded_model_acts_alike_and_goes_on_exactly(tmp_path):
-    whole = agent(ClockEnv()).learn(42)
-    half = agent(ClockEnv()).learn(21)
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_a_loaded_model_acts_alike_and_goes_on_exactly(n_envs, tmp_path):
+    def environments():
+        return DummyVecEnv([ClockEnv] * n_envs)
+
+    whole = agent(environments()).learn(42 * n_envs)
+    half = agent(environments()).learn(21 * n_envs)
     half.save(tmp_path / "model")
     half.save_replay_buffer(tmp_path / "replay.zip")
-    loaded = DrQv2.load(tmp_path / "model", env=ClockEnv(), device="cpu")
+    loaded = DrQv2.load(tmp_path / "model", env=environments(), device="cpu")
     loaded.load_replay_buffer(tmp_path / "replay.zip")
     assert same(weights(half), weights(loaded))
     image = ClockEnv().reset()[0]
@@ -108,8 +112,9 @@ def test_a_loaded_model_acts_alike_and_goes_on_exactly(tmp_path):
         torch.manual_seed(0)
         other, _ = loaded.predict(image, deterministic=deterministic)
         assert (one == other).all()
-    loaded.learn(21, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 42 and same(weights(whole), weights(loaded))
+    loaded.learn(21 * n_envs, reset_num_timesteps=False)
+    assert loaded.progress == whole.progress and loaded.num_timesteps == 42 * n_envs
+    assert same(weights(whole), weights(loaded))
 
 
 def test_the_model_file_holds_no_pickle_and_other_classes_refuse_it(tmp_path):

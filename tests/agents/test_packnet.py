@@ -10,6 +10,7 @@ from debug_agent import ClockEnv, noise, same, weights
 from torch import nn
 from toy_env import DotEnv
 
+from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.packnet import FREE, PackNet, prune
 
 SETTINGS = {
@@ -51,6 +52,16 @@ def test_a_sequence_shares_the_weights_equally():
         owner = prune(torch.randn(100, 7), owner, task, left)
     shares = [(owner == task).sum().item() for task in (0, 1, 2, 3, 4, FREE)]
     assert sum(shares) == 700 and max(shares) - min(shares) <= 1
+
+
+def test_the_first_task_is_learned_as_by_drqv2():
+    settings = {k: v for k, v in SETTINGS.items() if k not in ("retrain", "tasks")}
+    ours, plain = agent(ClockEnv(25)), DrQv2("CnnPolicy", ClockEnv(25), **settings)
+    names = "encoder", "actor", "critic", "target_critic"
+    before = weights(plain, *names)
+    assert same(before, weights(ours, *names))
+    assert same(weights(ours.learn(50), *names), weights(plain.learn(50), *names))
+    assert not same(before, weights(plain, *names))
 
 
 @pytest.mark.slow

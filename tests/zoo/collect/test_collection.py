@@ -1,11 +1,12 @@
 import json
 import zlib
 from collections import Counter
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from debug_agent import SETTINGS, agent
+from debug_agent import SETTINGS, ClockEnv, agent
 from stable_baselines3 import SAC
 from zoo_command import call
 
@@ -350,6 +351,16 @@ def test_a_curious_agent_that_was_stopped_goes_on_to_the_same_data(
     assert len(TrajectoryDataset.open(tmp_path)) == 3 * ((stop_at - 1) // 3)
     monkeypatch.setattr(Plan2Explore, "save", save)
     assert same(explored, curious(tmp_path))
+
+
+def test_a_curious_agent_whose_episodes_terminate_goes_on_to_the_same_data(tmp_path):
+    settings = QUICK | {"train_ratio": 4, "learning_starts": 0, "warmup_steps": 0}
+    for name, parts in (("whole", [4]), ("stopped", [2, 4])):
+        for episodes in parts:
+            make = partial(ClockEnv, terminates=True)
+            list(explore(Expedition(DOT, episodes, 0, "icm", tmp_path / name, make, settings)))
+    whole, stopped = (TrajectoryDataset.open(tmp_path / n / "data") for n in ("whole", "stopped"))
+    assert whole[3].terminated and same(whole, stopped)
 
 
 def test_a_curious_agent_killed_while_its_folder_is_made_goes_on(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS, Explorer
@@ -74,7 +75,9 @@ def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explo
         return kind("WPTPolicy", env, seed=trip.seed, **keywords)
     model = kind.load(file, env=env)
     for trajectory in store.subset(range(model.episodes)):
-        model.replay_buffer.add(trajectory)
+        # Nothing learns from the task's rewards, but that they are known marks the task's episodes.
+        reward = trajectory.reward if trip.rewards else np.zeros(len(trajectory), np.float32)
+        model.replay_buffer.add(replace(trajectory, reward=reward))
     return model
 
 

@@ -881,6 +881,8 @@ def test_kickstarting_alone_has_a_clone_and_wants_windows_of_three_images(store)
         agent(DotEnv(), kickstart=1, batch_length=2)
     with pytest.raises(ValueError, match=r"actor_delay .*3 images.*batch_length=2"):
         agent(DotEnv(), actor_delay=1, guidance=1, batch_length=2)
+    with pytest.raises(ValueError, match=r"residual .*3 images.*batch_length=2"):
+        agent(DotEnv(), residual=True, guidance=0, batch_length=2)
     agent(DotEnv(), actor_delay=1, guidance=0, batch_length=2)  # imitates nobody
 
 

@@ -349,11 +349,13 @@ class Hyperparameters(Keywords):
                 f"kickstart looks at {FRAMES} images in a row, but batch_length="
                 f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
             )
-        if self.actor_delay and self.needs_clone and self.batch_length < FRAMES:
+        head_start = self.actor_delay and self.needs_clone
+        if (head_start or self.residual) and self.batch_length < FRAMES:
+            name = "residual" if self.residual else "actor_delay"
             raise ValueError(
-                f"actor_delay imitates the prior actor, which looks at {FRAMES} images in a row, "
-                f"but batch_length={self.batch_length}: use batch_length={FRAMES} or more, or "
-                "actor_delay=0"
+                f"{name} imitates the prior actor, which looks at {FRAMES} images in a row, but "
+                f"batch_length={self.batch_length}: use batch_length={FRAMES} or more, or leave "
+                f"{name} out"
             )
 
     @property

@@ -67,7 +67,8 @@ def test_the_imitator_is_the_actor_at_the_end_of_the_head_start(data):
 
 
 def test_the_imitator_learns_beside_the_others_and_changes_none_of_them(data, tmp_path):
-    model = learned(data, train_ratio=1e-9)
+    # `imitation_grad` is of the actor's imitation, which ends with the head start
+    model = learned(data, train_ratio=1e-9, kickstart=0.0, imitation_grad=100.0)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "replay")
     after = []

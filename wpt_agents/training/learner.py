@@ -99,7 +99,7 @@ class Learner(WorldModelLearner):
         imitator = self.policy.imitator
         advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
-        if advice is not None and self.hyperparameters.imitation_grad:
+        if advice is not None and imitation_weight and self.hyperparameters.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
         post, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)

@@ -29,7 +29,10 @@ def main() -> None:
         help="Print the CPU time of a step for each rendering and the simulator's own renderer.",
     )
     speed.add_argument(
-        "--rounds", type=int, default=5, help="Number of rounds, ten steps each; the median counts."
+        "--rounds",
+        type=int,
+        default=5,
+        help="Number of rounds of ten steps; the median is printed.",
     )
     arguments = vars(parser.parse_args())
     run: dict[str, Callable[..., None]] = {

@@ -36,16 +36,16 @@ def pixels(
     :param image_size: side of the observed image, to which larger images are shrunk
     :param action_repeat: steps of `env` in one step, their rewards summed
     :param pad_action_to: width to which actions are padded
-    :param rendering: `exact`, `near` or `fast` draws a MuJoCo environment several times quicker
-        than its own `render()` does
+    :param rendering: `exact`, `near` or `fast` draws a MuJoCo environment several times faster
+        than its own `render()`
     :param camera: name, number or attributes of the camera to draw from, only together with
         `rendering`; the environment's own if None
-    :param image_key: the entry of Dict observations that is the picture, in place of `render()`
-    :param crop: cut out the middle square of pictures that are not square; they are squeezed, with
-        a warning, if False. With `rendering` pictures are always square
+    :param image_key: the entry of Dict observations to use as the image instead of `render()`
+    :param crop: crop images that are not square to the middle square; if False, they are squeezed
+        with a warning. With `rendering`, images are always square
     :param state_in_info: put the observation of `env` into `info["state"]`
     :param render_size: side of what `render()` returns; the last observation if None
-    :raises ValueError: an environment that cannot be shown in this way
+    :raises ValueError: if the environment cannot provide such images
 
     >>> env = wpt_envs.pixels(gym.make("Ant-v5", render_mode="rgb_array"))
     """
@@ -72,7 +72,7 @@ def _looked_at(
         raise ValueError(f"camera={camera!r} needs our renderer: add rendering='near', for example")
     if image_key is not None:
         if rendering is not None:
-            raise ValueError("image_key and rendering are two ways to see: give one of them")
+            raise ValueError("image_key and rendering cannot be combined: pass only one of them")
         return _LookObserved(env, image_key, crop)
     if rendering is None:
         return _LookRendered(env, crop)
@@ -82,7 +82,7 @@ def _looked_at(
 
 
 def _instead(env: Any) -> str:
-    """What came in place of an environment, and what to write."""
+    """Describe an argument that is not an environment, and how to make it one."""
     if isinstance(env, str):
         return f"an id: `env = wpt_envs.pixels(gymnasium.make({env!r}, render_mode='rgb_array'))`"
     if hasattr(env, "num_envs"):
@@ -100,7 +100,7 @@ def _instead(env: Any) -> str:
 
 
 class _LookRendered(gym.Wrapper):
-    """Looks by `env.render()`."""
+    """Take images from `env.render()`."""
 
     def __init__(self, env: gym.Env, crop: bool = False) -> None:
         super().__init__(env)
@@ -117,7 +117,7 @@ class _LookRendered(gym.Wrapper):
 
 
 class _LookObserved(gym.Wrapper):
-    """Looks at one entry of the Dict observations."""
+    """Take images from one entry of the Dict observations."""
 
     def __init__(self, env: gym.Env, image_key: str, crop: bool = False) -> None:
         super().__init__(env)
@@ -125,7 +125,7 @@ class _LookObserved(gym.Wrapper):
         if not isinstance(space, spaces.Dict):
             raise ValueError(
                 f"image_key={image_key!r} chooses from Dict observations, but those of {env} are "
-                f"{space}: leave image_key out"
+                f"{space}: omit image_key"
             )
         if image_key not in space.spaces:
             names = ", ".join(map(repr, space.spaces))
@@ -154,25 +154,25 @@ class _LookObserved(gym.Wrapper):
 
 
 class _LookDrawn(gym.Wrapper):
-    """Looks through a camera of this package's renderer."""
+    """Draw images with this package's renderer."""
 
     def __init__(self, env: gym.Env, rendering: str, camera: "Camera | None" = None) -> None:
         super().__init__(env)
         self._simulation = find_simulation(env.unwrapped)
         if self._simulation is None:
             raise ValueError(
-                f"rendering={rendering!r} draws MuJoCo simulations, and none was found in {env}: "
-                "leave rendering out, which takes the picture that its render() returns"
+                f"rendering={rendering!r} needs a MuJoCo simulation, and none was found in {env}: "
+                "omit rendering to use the image that its render() returns"
             )
         self._rendering, self._camera = rendering, camera
         self._view: View | None = None
         self._model: Any = None
-        self._open()  # complains now of an unknown rendering or camera
-        self._model = None  # the usual camera looks at the middle of the first picture
+        self._open()  # fails early on an unknown rendering or camera
+        self._model = None  # the default camera looks at the middle of the first image
 
     def _open(self) -> "View":
         """The view of the simulation, a new one where the environment has made a new model."""
-        from wpt_envs.rendering import View  # brings MuJoCo, which a CartPole does not need
+        from wpt_envs.rendering import View  # imports MuJoCo, which CartPole does not need
 
         simulation = model_and_data(self._simulation)
         assert simulation is not None, self._simulation

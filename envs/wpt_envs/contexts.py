@@ -18,10 +18,9 @@ def _egl() -> Any | None:
 
 
 def new_context(side: int) -> Any:
-    """Make a context for pictures of `side` x `side`, by what MUJOCO_GL says now.
+    """Make a context for images of `side` x `side` with the current value of MUJOCO_GL.
 
-    `mujoco.gl_context` holds what the variable said when MuJoCo was first imported, which may have
-    been before it was corrected.
+    `mujoco.gl_context` uses the value at MuJoCo's first import, which may be outdated.
     """
     backend = os.environ.get("MUJOCO_GL")
     egl = _egl()
@@ -42,7 +41,7 @@ def new_context(side: int) -> Any:
 
 @contextmanager
 def current(gl: Any) -> Iterator[None]:
-    """Make a context current, and afterwards the one that was before: others rely on theirs."""
+    """Make a context current, and restore the previous one on exit for other renderers."""
     egl = _egl()
     if egl is None:
         gl.make_current()

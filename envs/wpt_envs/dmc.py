@@ -20,7 +20,7 @@ import mujoco
 from dm_control.rl.control import Environment
 
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
-_CAMERAS = {"quadruped": 2}  # the other domains are seen by their first camera
+_CAMERAS = {"quadruped": 2}  # the other domains use their first camera
 
 
 def make(
@@ -107,7 +107,7 @@ class DMControl(Simulated):
         physics = self.dm_env.physics
         spec = self.dm_env.action_spec()
         self._range = (spec.minimum, spec.maximum) if rescale_action else None
-        if floor is not None:  # a plane is endless to the simulator; this is what is drawn
+        if floor is not None:  # the simulator's plane is infinite; this is the part that is drawn
             physics.model.geom_size[physics.model.geom_type == _PLANE, 0] = floor
         camera = _CAMERAS.get(task.embodiment, 0) if camera is None else camera
         self.view = View(physics.model.ptr, physics.data.ptr, rendering, camera)
@@ -135,7 +135,7 @@ class DMControl(Simulated):
             low, high = self._range
             action = low + (action + 1) / 2 * (high - low)
         timestep = self.dm_env.step(action)
-        if timestep.first():  # dm_control has begun a new episode unasked
+        if timestep.first():  # dm_control has started a new episode on its own
             raise ResetNeeded("The episode has ended: call reset() before the next step()")
         terminated = timestep.last() and timestep.discount == 0
         truncated = timestep.last() and not terminated

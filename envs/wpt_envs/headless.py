@@ -1,9 +1,9 @@
-"""Chooses how to draw without a display, before mujoco or dm_control is imported.
+"""Choose an off-screen backend before mujoco or dm_control is imported.
 
-On Linux with `MUJOCO_GL` unset MuJoCo asks for a window and, without a display, aborts the process.
+On Linux with `MUJOCO_GL` unset, MuJoCo opens a window, and aborts the process without a display.
 Importing this package therefore sets it to `egl`, and the first task or renderer changes that to
-`osmesa` if EGL does not work and OSMesa is there. What the user has set is kept where it works, and
-refused in one sentence where it does not.
+`osmesa` if EGL does not work and OSMesa is installed. A value that the user has set is kept if it
+works; otherwise an error says which value does.
 """
 
 import ctypes
@@ -17,8 +17,8 @@ _INSTALL = (
     "Drawing off screen needs EGL or OSMesa. If neither works, install one: "
     "`apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri` or `apt-get install libosmesa6`."
 )
-_ANY = ("", "on", "enable", "enabled", "true", "1")  # values of MUJOCO_GL that leave the choice
-_NONE = ("off", "disable", "disabled", "false", "0")  # and those that forbid to draw
+_ANY = ("", "on", "enable", "enabled", "true", "1")  # values of MUJOCO_GL that mean "unset"
+_NONE = ("off", "disable", "disabled", "false", "0")  # values that disable rendering
 _WINDOW = ("glfw", "glx")
 _OFF_SCREEN = ("egl", "osmesa")
 _EGL_VARIABLES = ("__EGL_VENDOR_LIBRARY_FILENAMES", "__EGL_VENDOR_LIBRARY_DIRS", "EGL_PLATFORM")
@@ -27,10 +27,10 @@ _preferred_here = False
 
 
 def prefer_egl() -> None:
-    """Set `MUJOCO_GL` where the user left the choice, and mend harmless spellings of it."""
+    """Set `MUJOCO_GL` if the user did not, and normalise its spelling."""
     global _preferred_here
     # Mesa's software rasteriser reads this when dm_control or MuJoCo first open it. At 64 x 64
-    # its threads cost more than they bring, and a forked process would wait for them for ever.
+    # its threads are slower than none, and a forked process would wait for them forever.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     if sys.platform != "linux":
         return
@@ -40,16 +40,16 @@ def prefer_egl() -> None:
         asked, _preferred_here = "osmesa" if wants_osmesa else "egl", not wants_osmesa
     os.environ["MUJOCO_GL"] = asked
     if not os.environ.get("MUJOCO_EGL_DEVICE_ID", "any").strip():
-        del os.environ["MUJOCO_EGL_DEVICE_ID"]  # MuJoCo cannot read an empty one
+        del os.environ["MUJOCO_EGL_DEVICE_ID"]  # MuJoCo fails on an empty value
     _agree_with_pyopengl()
     if "dm_control._render" in sys.modules:
         _correct_dm_control()
 
 
 def choose() -> None:
-    """Try out what `MUJOCO_GL` asks for; what `prefer_egl` set gives way to OSMesa if need be.
+    """Check that `MUJOCO_GL` works; replace a value set by `prefer_egl` with OSMesa if necessary.
 
-    :raises RuntimeError: a value that does not work here, with the value that would
+    :raises RuntimeError: if the value does not work here; names one that does
     """
     global _preferred_here
     asked = os.environ.get("MUJOCO_GL", "")
@@ -79,7 +79,7 @@ def choose() -> None:
 def _check_name(asked: str) -> None:
     if asked in _NONE:
         raise RuntimeError(
-            f"MUJOCO_GL={asked} forbids to draw, and pictures are drawn here: unset MUJOCO_GL, or "
+            f"MUJOCO_GL={asked} disables rendering, which this package needs: unset MUJOCO_GL, or "
             "set MUJOCO_GL=egl"
         )
     valid = (*_OFF_SCREEN, *_WINDOW)
@@ -93,7 +93,7 @@ def _check_name(asked: str) -> None:
 
 
 def _check_device() -> None:
-    """Refuse a number of a device that EGL does not have."""
+    """Raise an error if EGL has no device with the number that is set."""
     asked = os.environ.get("MUJOCO_EGL_DEVICE_ID")
     if asked is None:
         return
@@ -101,17 +101,17 @@ def _check_device() -> None:
     if not asked.strip().isdecimal() or not int(asked) < count:
         there = f"a number from 0 to {count - 1}" if count else "no device at all"
         raise RuntimeError(
-            f"MUJOCO_EGL_DEVICE_ID={asked} is no device of EGL, which has {there} here: unset it, "
-            "or set a number. EGL counts the GPUs from 0 and knows no names such as cuda:0"
+            f"MUJOCO_EGL_DEVICE_ID={asked} is not an EGL device; EGL has {there} here: unset it, "
+            "or set a number. EGL numbers the GPUs from 0 and has no names such as cuda:0"
         )
 
 
 def _suspects() -> str:
     suspects = [f"{name}={os.environ[name]}" for name in _EGL_VARIABLES if os.environ.get(name)]
-    return f" What is set may be the cause: {', '.join(suspects)}." if suspects else ""
+    return f" These variables may be the cause: {', '.join(suspects)}." if suspects else ""
 
 
-# ------------------------------------------------------------------------------- what works
+# ---------------------------------------------------------------------------- which backends work
 
 
 def _egl_library() -> ctypes.CDLL | None:
@@ -124,7 +124,7 @@ def _egl_library() -> ctypes.CDLL | None:
 
 
 def _egl_devices() -> list[int]:
-    """The handles of EGL's devices, asked of the library itself, which cannot abort."""
+    """The handles of EGL's devices, queried from the library, which cannot abort the process."""
     egl = _egl_library()
     query = egl.eglGetProcAddress(b"eglQueryDevicesEXT") if egl is not None else None
     if not query:
@@ -136,7 +136,7 @@ def _egl_devices() -> list[int]:
 
 
 def _egl_works() -> bool:
-    """Whether the device that is asked for opens, or any if none is."""
+    """Return whether the chosen device opens, or any device if none is chosen."""
     egl, devices = _egl_library(), _egl_devices()
     get_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT") if egl is not None else None
     if egl is None or not get_display:
@@ -170,7 +170,7 @@ def _window_works() -> bool:
         return bool(glfw.init())
 
 
-# ------------------------------------------------------------------- what others have chosen
+# ------------------------------------------------------------------- other libraries' choices
 
 
 def _pyopengl_platform() -> str:
@@ -178,7 +178,7 @@ def _pyopengl_platform() -> str:
 
 
 def _agree_with_pyopengl() -> None:
-    """Set `PYOPENGL_PLATFORM`, by which MuJoCo draws, to what `MUJOCO_GL` says."""
+    """Set `PYOPENGL_PLATFORM`, which MuJoCo uses, to the value of `MUJOCO_GL`."""
     asked = os.environ["MUJOCO_GL"]
     if asked in _OFF_SCREEN and _pyopengl_platform() not in ("", asked):
         os.environ["PYOPENGL_PLATFORM"] = asked
@@ -187,7 +187,7 @@ def _agree_with_pyopengl() -> None:
 def _correct_dm_control() -> None:
     """Let dm_control choose again if it was imported first and settled on a window system.
 
-    Its own `physics.render` would fail without a display, or abort the process.
+    Otherwise its `physics.render` would fail without a display, or abort the process.
     """
     render = sys.modules["dm_control._render"]
     if render.BACKEND in _OFF_SCREEN or _window_works():

@@ -12,7 +12,7 @@ from wpt_envs.rendering import QUALITIES, View
 from wpt_envs.simulated import Simulated
 from wpt_envs.tasks import Task
 
-THE_FOUR = (  # what the speed is quoted on
+THE_FOUR = (  # the tasks on which speed is reported
     "wpt/dmc-walker-run-v0",
     "wpt/dmc-quadruped-run-v0",
     "wpt/metaworld-button-press-v0",
@@ -58,10 +58,10 @@ def likeness(task: Task, states: int = 20, size: int = 64) -> dict[str, float]:
 
 
 def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:
-    """Return the CPU milliseconds of a step by each rendering and by the suite's own renderer.
+    """Return the CPU time of a step in ms for each rendering and for the suite's own renderer.
 
-    They take turns of `steps` steps, and the median of the rounds counts, so that other load on
-    the machine slows all of them alike.
+    They alternate every `steps` steps, and the median over rounds is returned, so that other
+    load on the machine affects all of them equally.
     """
     envs = {rendering: gym.make(task.id, rendering=rendering) for rendering in QUALITIES}
     envs["usual"] = gym.make(task.id)
@@ -80,7 +80,7 @@ def speed(task: Task, rounds: int = 5, steps: int = 10) -> dict[str, float]:
 
 
 def _step_cost(env: gym.Env, steps: int) -> float:
-    """Return the CPU milliseconds of a step, summed over the threads of the process."""
+    """Return the CPU time of a step in ms, summed over the threads of the process."""
     actions = [env.action_space.sample() for _ in range(steps)]
     start = time.process_time()
     for action in actions:
@@ -89,7 +89,7 @@ def _step_cost(env: gym.Env, steps: int) -> float:
 
 
 def usual_renderer(env: Any) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
-    """Return the suite's own renderer as two functions: one looks, the other frees it."""
+    """Return two functions for the suite's own renderer: one draws, the other frees it."""
     camera = env.view.camera
     if hasattr(env, "dm_env"):
         physics = env.dm_env.physics

@@ -1,4 +1,4 @@
-"""Pictures as environments return them, checked, made (H, W, 3) uint8 and shrunk to a square."""
+"""Check images that environments return, convert them to (H, W, 3) uint8, and shrink them."""
 
 import warnings
 from typing import Any
@@ -7,13 +7,13 @@ import numpy as np
 
 
 class PictureReader:
-    """Turn what one environment returns as its picture into (H, W, 3) uint8.
+    """Convert the images that one environment returns into (H, W, 3) uint8.
 
-    Bytes are taken as they are, other whole numbers if they are in [0, 255]. Floats are in [0, 1]
-    or in [0, 255]: the first picture that is not black decides, and holds for all that follow.
+    uint8 images are kept, other integers must be in [0, 255]. Floats are in [0, 1] or in
+    [0, 255]: the first image that is not black decides for all that follow.
 
-    :param source: what returns the pictures, for messages, such as "render() of <CarRacing>"
-    :param remedy: what to do if there is no picture at all
+    :param source: the source of the images, for messages, such as "render() of <CarRacing>"
+    :param remedy: what the user can do if there is no image
     :param crop: cut out the middle square; otherwise the first picture that is not square causes a
         warning, because `shrink` will squeeze it
     """
@@ -28,9 +28,9 @@ class PictureReader:
     def read(self, picture: Any) -> np.ndarray:
         """Check and convert one picture.
 
-        :param picture: (H, W, 3), or with one channel or four, or with the channels first
+        :param picture: (H, W, 3), or with one or four channels, or with channels first
         :return: (H, W, 3) uint8, a view where nothing had to be converted; with `crop`, H = W
-        :raises ValueError: anything else, by what it is
+        :raises ValueError: if it is anything else
         """
         if picture is None or isinstance(picture, str | bytes | dict):
             what = "None" if picture is None else f"a {type(picture).__name__}"
@@ -83,7 +83,7 @@ class PictureReader:
             raise ValueError(f"{self.source} returned an array of {array.dtype}, not of numbers")
         low, high = float(array.min()), float(array.max())
         scale = self._scale_of(array.dtype, high)
-        if not (low >= 0 and high * scale <= 255.5):  # NaN fails this, too
+        if not (low >= 0 and high * scale <= 255.5):  # also rejects NaN
             ends = "[0, 1]" if scale == 255 else "[0, 255]"
             raise ValueError(
                 f"{self.source} returned {array.dtype} values from {low:.4g} to {high:.4g}, beyond "
@@ -109,7 +109,7 @@ def middle_square(picture: np.ndarray) -> np.ndarray:
 
 
 def shrink(picture: np.ndarray, size: int) -> np.ndarray:
-    """Average over areas, which keeps thin lines. Pictures that are not square are squeezed.
+    """Shrink by averaging areas, which keeps thin lines. Images that are not square are squeezed.
 
     :param picture: (H, W, 3) uint8
     :return: (size, size, 3) uint8

@@ -29,10 +29,10 @@ Camera = str | int | dict[str, Any]  # a name, a number, or the free camera's at
 
 @dataclass(frozen=True)
 class Quality:
-    """How much a rendering computes; None keeps the model's own setting."""
+    """The settings of a rendering; None keeps the model's own setting."""
 
     samples: int | None = None  # multisampling
-    supersample: int = 1  # draws larger by this factor, then averages
+    supersample: int = 1  # the image is drawn larger by this factor, then averaged
     shadow_size: int | None = None  # texels of the shadow map
     tessellation: tuple[int, int, int] | None = None  # slices, stacks, quads of round shapes
     floor_spacing: float = 1  # widens the grid on which a floor is lit
@@ -67,8 +67,8 @@ QUALITIES = {
 class Renderer:
     """Draws `data` as one camera sees it, without any effect on the physics.
 
-    The GL context is made at the first picture, so that environments that never draw need none. It
-    is current only while this draws, so that other renderers are not disturbed.
+    The GL context is made at the first image, so that environments that never draw need none. It
+    is current only while drawing, so that other renderers are not disturbed.
 
     :param camera: name or number of a camera of the model, -1 for the free camera, or a dict of
         attributes of the free camera, such as `distance`
@@ -226,7 +226,7 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 @contextmanager
 def _lowered(model: mujoco.MjModel, quality: Quality, side: int) -> Iterator[None]:
-    """Lower what a GL context reads of the model while it is made, then restore all of it."""
+    """Lower the model's quality settings while a GL context is made, then restore them."""
     detail, window = model.vis.quality, model.vis.global_
     slices, stacks, quads = quality.tessellation or (None, None, None)
     numbers = [

@@ -1,4 +1,4 @@
-"""Gymnasium-Robotics: Fetch, the Shadow hand and Adroit, an extra suite of further embodiments."""
+"""Gymnasium-Robotics: Fetch, the Shadow hand and Adroit, which are not in the paper."""
 
 from contextlib import redirect_stderr
 from io import StringIO
@@ -15,7 +15,7 @@ from wpt_envs.simulation import fixed_usual_camera
 from wpt_envs.wrappers import dress
 
 # isort: split
-with redirect_stderr(StringIO()):  # it prints a notice on versions, and ours is fixed
+with redirect_stderr(StringIO()):  # it prints a notice about versions, but ours is pinned
     import gymnasium_robotics
 
 _IDS = {
@@ -128,7 +128,7 @@ class Robotics(Achieved):
         return self._state(observation), float(reward), False, *self._stepped(success)
 
     def _state(self, observation: Any) -> np.ndarray:
-        """Flatten the observation, and move the goal's marker, which otherwise moves at drawing."""
+        """Flatten the observation, and move the goal's marker, which only render() would move."""
         show_goal = getattr(self.robot, "_render_callback", None)
         if show_goal is not None:
             show_goal()

@@ -1,4 +1,4 @@
-"""The base of the suites: a MuJoCo task at its control rate, seen by one camera."""
+"""The base class of the suites: a MuJoCo task at its control rate with one camera."""
 
 from typing import Any
 
@@ -65,7 +65,7 @@ class Simulated(gym.Env):
 
 
 class Achieved(Simulated):
-    """A task that reports success at this step and at any step so far, and goes on after it."""
+    """A task that reports success at this step and so far, and continues after it."""
 
     def _began(self) -> dict[str, Any]:
         """Return the info of a reset."""

@@ -1,4 +1,4 @@
-"""Finds the MuJoCo simulation inside somebody's environment, and the camera it is shown by."""
+"""Find the MuJoCo simulation inside any environment, and the camera that it renders with."""
 
 import sys
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
     from wpt_envs.rendering import Camera
 
-DEPTH = 4  # attributes of attributes that are looked through: env._env._physics is 2
+DEPTH = 4  # depth of the search in attributes: env._env._physics is 2
 
 
 def find_simulation(env: Any) -> Any | None:
     """Return the object that holds model and data, the nearest one, or None.
 
-    It is Gymnasium's MujocoEnv itself, dm_control's Physics, robosuite's MjSim, or something like
-    them, in an attribute of the environment or in an attribute of an attribute.
+    It is Gymnasium's MujocoEnv, dm_control's Physics, robosuite's MjSim or a similar object, in an
+    attribute of the environment or in an attribute of an attribute.
     """
     if "mujoco" not in sys.modules:
         return None
@@ -44,7 +44,7 @@ def model_and_data(holder: Any) -> "tuple[mujoco.MjModel, mujoco.MjData] | None"
 
 
 def _raw(wrapper: Any, kind: type) -> Any:
-    """The object of MuJoCo's own behind dm_control's wrapper (`ptr`) or robosuite's (`_model`)."""
+    """Return MuJoCo's own object behind dm_control's wrapper (`ptr`) or robosuite's (`_model`)."""
     for value in (wrapper, *(getattr(wrapper, name, None) for name in ("ptr", "_model", "_data"))):
         if isinstance(value, kind):
             return value
@@ -62,7 +62,7 @@ def _attributes(holder: Any, seen: set[int]) -> Iterator[Any]:
 
 
 def usual_camera(env: Any, model: "mujoco.MjModel", data: "mujoco.MjData") -> "Camera":
-    """Return the camera by which an environment shows itself, -1 (free) if it names none.
+    """Return the camera that an environment renders with, -1 (free) if it names none.
 
     Gymnasium's renderer takes a camera of the model, or else the free camera with the environment's
     own settings, looking at the middle of all shapes.

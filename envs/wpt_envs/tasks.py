@@ -56,9 +56,9 @@ class Task:
     name: str
     embodiment: str
     action_dim: int  # true width, without padding
-    frames: int  # control steps an episode, before any action repeat
+    frames: int  # control steps per episode, before any action repeat
     metric: str  # "return", or "success" at the last step
-    in_paper: bool  # counts among the 22 + 50
+    in_paper: bool  # one of the paper's 22 + 50 tasks
 
     @property
     def id(self) -> str:

@@ -9,7 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 
 class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
-    """Refuses an action of the wrong shape, outside the Box or not finite, before it is taken."""
+    """Raise an error for an action of the wrong shape, outside the Box or not finite."""
 
     def __init__(self, env: gym.Env) -> None:
         RecordConstructorArgs.__init__(self)
@@ -19,7 +19,7 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
         """Return the same action as float32.
 
         :param action: (A,)
-        :raises ValueError: an action that the environment does not take
+        :raises ValueError: if the action is invalid
         """
         action = np.asarray(action, np.float32)
         box = self.action_space
@@ -37,7 +37,7 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
 
 
 class PadAction(gym.ActionWrapper, RecordConstructorArgs):
-    """Widens the actions to `size`, and passes the leading entries to the environment."""
+    """Widen the action space to `size`, and pass the leading entries to the environment."""
 
     def __init__(self, env: gym.Env, size: int) -> None:
         RecordConstructorArgs.__init__(self, size=size)
@@ -62,7 +62,7 @@ class PadAction(gym.ActionWrapper, RecordConstructorArgs):
 
 
 class RepeatAction(gym.Wrapper, RecordConstructorArgs):
-    """Applies each action `times` times, sums the rewards, and stops where the episode ends."""
+    """Apply each action `times` times, sum the rewards, and stop when the episode ends."""
 
     def __init__(self, env: gym.Env, times: int) -> None:
         RecordConstructorArgs.__init__(self, times=times)
@@ -86,7 +86,7 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
 
 
 class SeePixels(gym.Wrapper, RecordConstructorArgs):
-    """Replaces the observation by the picture, which is taken once after each step.
+    """Replace the observation with an image, which is drawn once after each step.
 
     The environment underneath must have `look(size)`, which returns (size, size, 3) uint8.
 

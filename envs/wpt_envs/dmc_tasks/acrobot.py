@@ -12,7 +12,7 @@ SUITE = containers.TaggedTasks()
 
 
 class HardBalance(HardReward, acrobot.Balance):
-    """Swing up, paid only near the target."""
+    """Swing up, rewarded only near the target."""
 
 
 @SUITE.add("custom")

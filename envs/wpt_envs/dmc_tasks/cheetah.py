@@ -11,11 +11,11 @@ from wpt_envs.dmc_tasks.hard import HardReward
 
 SUITE = containers.TaggedTasks()
 
-_GROUND = 200  # half length; the stock 100 ends under a cheetah which runs backwards
+_GROUND = 200  # half length; the stock value 100 is too short for running backwards
 
 
 class HardCheetah(HardReward, cheetah.Cheetah):
-    """The stock run, paid only from 2 m/s on."""
+    """The stock run, rewarded only from 2 m/s."""
 
     threshold = 0.2
 
@@ -24,7 +24,7 @@ class BackwardsCheetah(cheetah.Cheetah):
     """Run backwards."""
 
     def get_reward(self, physics: cheetah.Physics) -> float:
-        """Rises from 0 at rest to 1 at 8 m/s backwards."""
+        """The reward rises from 0 at rest to 1 at 8 m/s backwards."""
         return _speed(-physics.speed(), 8)
 
 

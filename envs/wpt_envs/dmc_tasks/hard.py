@@ -1,4 +1,4 @@
-"""The hard variant of a reward: nothing below a threshold, and effort costs."""
+"""The hard variant of a reward: zero below a threshold, with a cost for effort."""
 
 import numpy as np
 from dm_control.mujoco import Physics
@@ -6,7 +6,7 @@ from dm_control.suite.base import Task
 
 
 class HardReward(Task):
-    """Put before a task's class: r' = (r if r >= threshold else 0) - 0.1 ||a||.
+    """A mixin to list before a task's class: r' = (r if r >= threshold else 0) - 0.1 ||a||.
 
     The action is the agent's own, before actuators clip it, at every control step.
     """
@@ -15,7 +15,7 @@ class HardReward(Task):
     price = 0.1
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Remembers the effort.
+        """Store the norm of the action.
 
         :param action: (A,)
         """
@@ -23,6 +23,6 @@ class HardReward(Task):
         super().before_step(action, physics)
 
     def get_reward(self, physics: Physics) -> float:
-        """The task's reward if it is high enough, less the effort's price."""
+        """Return the task's reward if it reaches the threshold, minus the cost of the action."""
         reward = super().get_reward(physics)
         return (reward if reward >= self.threshold else 0.0) - self.price * self._effort

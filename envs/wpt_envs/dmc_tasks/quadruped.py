@@ -40,7 +40,7 @@ class Jump(Stand):
 
 
 class Roll(Stand):
-    """Upright, and fast in whatever direction, the torso's own velocity in 3-D."""
+    """Upright and fast in any direction, by the speed of the torso in 3-D."""
 
     def __init__(self, speed: float, random: Any = None) -> None:
         super().__init__(random=random)

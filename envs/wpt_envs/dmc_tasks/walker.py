@@ -12,7 +12,7 @@ SUITE = containers.TaggedTasks()
 
 
 class HardWalker(HardReward, walker.PlanarWalker):
-    """The stock walk, paid only when it goes well."""
+    """The stock walk, rewarded only above a threshold."""
 
 
 class BackwardsWalker(walker.PlanarWalker):

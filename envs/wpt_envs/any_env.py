@@ -72,7 +72,7 @@ def _looked_at(
         raise ValueError(f"camera={camera!r} needs our renderer: add rendering='near', for example")
     if image_key is not None:
         if rendering is not None:
-            raise ValueError("image_key and rendering cannot be combined: pass only one of them")
+            raise ValueError("image_key and rendering are two ways to see: pass only one of them")
         return _LookObserved(env, image_key, crop)
     if rendering is None:
         return _LookRendered(env, crop)
@@ -162,7 +162,7 @@ class _LookDrawn(gym.Wrapper):
         if self._simulation is None:
             raise ValueError(
                 f"rendering={rendering!r} needs a MuJoCo simulation, and none was found in {env}: "
-                "omit rendering to use the image that its render() returns"
+                "leave rendering out to use the image that its render() returns"
             )
         self._rendering, self._camera = rendering, camera
         self._view: View | None = None

@@ -79,7 +79,7 @@ def choose() -> None:
 def _check_name(asked: str) -> None:
     if asked in _NONE:
         raise RuntimeError(
-            f"MUJOCO_GL={asked} disables rendering, which this package needs: unset MUJOCO_GL, or "
+            f"MUJOCO_GL={asked} forbids to draw, which this package needs: unset MUJOCO_GL, or "
             "set MUJOCO_GL=egl"
         )
     valid = (*_OFF_SCREEN, *_WINDOW)

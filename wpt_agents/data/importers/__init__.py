@@ -4,6 +4,6 @@ Example::
 
     dataset = TrajectoryDataset.from_npz("exorl/walker", "walker-store", embodiment="walker")
 
-Formats differ in which action belongs to which image. Each reader documents its format's timing,
-and converts it to that of `wpt_agents.data.trajectory`.
+Formats differ in which action belongs to which image. Each reader documents the convention of its
+format, and converts it to that of `wpt_agents.data.trajectory`.
 """

@@ -16,7 +16,7 @@ from wpt_agents.data.units import both_limits, rescaled
 class Episodes(ABC):
     """Episodes in a fixed order, each read and converted when it is accessed.
 
-    An episode of a single image contains no action and is left out with a warning.
+    Episodes with a single image contain no action and are skipped with a warning.
 
     :param image_size: height and width to resize to
     :param rewards: whether to keep the rewards; pre-training needs none
@@ -26,8 +26,8 @@ class Episodes(ABC):
         is missing or if there are several
     :param action_key: the name of the actions, or several names whose arrays are concatenated in
         that order; in a string, they are separated by commas
-    :param done_key: the name of the flags at which an episode ends, or of the flag that its end is
-        a terminal state where the format itself separates episodes
+    :param done_key: the name of the flags that mark the end of an episode; if the format itself
+        separates episodes, the name of the flag that marks a terminal state
     :param low: (A,) or one number: the actions' lowest values, if they are not in [-1, 1]
     :param high: (A,) or one number: their highest values
     :param crop: cut out the middle square of images that are not square, instead of squeezing them
@@ -68,7 +68,7 @@ class Episodes(ABC):
     def __getitem__(self, i: int) -> Trajectory:
         """Episode `i`, 0 <= i < len.
 
-        :raises ValueError: it cannot be read or converted; names the file and the remedy
+        :raises ValueError: if it cannot be read or converted; names the file and the remedy
         """
 
     def __iter__(self) -> Iterator[Trajectory]:
@@ -83,9 +83,9 @@ class Episodes(ABC):
         limits: tuple[np.ndarray, np.ndarray] | None = None,
         **labels: Any,
     ) -> Trajectory:
-        """Check and convert an episode in our timing: (T + 1, ...), (T, A) and (T,).
+        """Check and convert an episode in our convention: (T + 1, ...), (T, A) and (T,).
 
-        :param limits: of the actions, by the format; the user's have precedence
+        :param limits: the format's action limits; the user's limits take precedence
         """
         try:
             action = as_actions(action)
@@ -115,7 +115,7 @@ class Episodes(ABC):
         """Warn once if actions lie outside the limits: they are clipped."""
         if self._warned_of_clipping or action.shape[1:] != low.shape or low.shape != high.shape:
             return
-        slack = 1e-3 * (high - low)  # rounding of what a robot measured is no reason to warn
+        slack = 1e-3 * (high - low)  # do not warn about rounding errors of measured actions
         outside = ((action < low - slack) | (action > high + slack)).any(0)
         if outside.any():
             self._warned_of_clipping = True
@@ -133,7 +133,7 @@ class Episodes(ABC):
 
 
 def as_keys(names: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Names of arrays as a tuple; a string may hold several, separated by commas."""
+    """Return names of arrays as a tuple; a string may contain several, separated by commas."""
     if names is None:
         return ()
     parts = names.split(",") if isinstance(names, str) else names
@@ -141,17 +141,17 @@ def as_keys(names: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def warn_left_out(count: int, source: object) -> None:
-    """Say how many episodes of a single image a reader leaves out."""
+    """Warn about episodes with a single image, which a reader skips."""
     if count:
         warnings.warn(
-            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, as no image "
-            "shows the outcome of an action",
+            f"{source}: {count} episode{'s' * (count > 1)} of a single image left out, because "
+            "no image shows the outcome of an action",
             stacklevel=3,
         )
 
 
 def needs(module: str, what: str) -> Any:
-    """Import an optional package, or say how to get it."""
+    """Import an optional package, or raise an error that says how to install it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -160,29 +160,31 @@ def needs(module: str, what: str) -> Any:
 
 
 def as_actions(action: np.ndarray) -> np.ndarray:
-    """Actions as (T, A) floats.
+    """Return actions as (T, A) floats.
 
-    :raises ValueError: anything that is not an array of continuous actions
+    :raises ValueError: if it is not an array of continuous actions
     """
     action = np.asarray(action)
     if action.ndim == 1 and action.dtype.kind in "iub":
         raise ValueError(
-            f"the action of a step is one whole number ({action.dtype}), as of discrete actions; "
-            "WPT takes continuous ones, (T, A)"
+            f"the action of a step is one whole number ({action.dtype}), a discrete action; "
+            "WPT needs continuous actions of shape (T, A)"
         )
     if action.ndim == 1:
         action = action[:, None]  # a single actuator
     if action.ndim != 2 or action.dtype.kind not in "fiub":
-        raise ValueError(f"actions must be numbers (T, A), got {action.shape} {action.dtype}")
+        raise ValueError(
+            f"actions must be numbers of shape (T, A), got {action.shape} {action.dtype}"
+        )
     return np.ascontiguousarray(action, np.float32 if action.dtype == np.float32 else np.float64)
 
 
 def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
-    """Colour images, channels first or last, resized; of stacked frames, the newest.
+    """Return resized colour images; of stacked frames, only the newest.
 
     :param image: (N, H, W, 3 k) or (N, 3 k, H, W) uint8, or whole numbers 0 .. 255 as floats
     :return: (N, S, S, 3) uint8
-    :raises ValueError: anything else; names shape, dtype or range, and the remedy
+    :raises ValueError: if it is anything else; names shape, dtype or range, and the remedy
     """
     image = np.asarray(image)
     if image.ndim == 3 and image.dtype == np.uint8:
@@ -195,7 +197,9 @@ def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
             f"the observations are {image.shape} {image.dtype}, not (N, H, W, 3) uint8 images; "
             "name the images' key, image_key (--image-key), or render the states first"
         )
-    if image.shape[1] < min(image.shape[2:]):  # fewer rows than any other side: these are channels
+    if image.shape[1] < min(
+        image.shape[2:]
+    ):  # the axis is smaller than the others, so it is the channel axis
         image = image.transpose(0, 2, 3, 1)
     _check_channels(image)
     return resize(_as_bytes(image)[..., -3:])
@@ -216,7 +220,7 @@ def _check_channels(image: np.ndarray) -> None:
 
 
 def _as_bytes(image: np.ndarray) -> np.ndarray:
-    """The images as uint8; floats that are bytes in fact are taken, other floats refused."""
+    """Return the images as uint8; floats are accepted only if they are whole numbers 0 .. 255."""
     if image.dtype == np.uint8:
         return image
     least, most = float(image.min()), float(image.max())

@@ -1,4 +1,4 @@
-"""The formats that can be read, and which of them a path looks like."""
+"""The formats that can be read, and their recognition by path."""
 
 import inspect
 import os
@@ -37,10 +37,10 @@ Source = str | os.PathLike[str]
 def open_episodes(
     source: Source | ReplayBuffer, form: str | None = None, **options: Any
 ) -> Episodes:
-    """Open the episodes at `source`, in the format `form` or in the one that it looks like.
+    """Open the episodes at `source`, in the format `form` or in the one that is recognised.
 
     :param options: the reader's own keywords, and those of `Episodes`
-    :raises ValueError: an unknown format or option, or a source that is not recognised
+    :raises ValueError: if the format, an option or the source is unknown
     """
     if isinstance(source, str | os.PathLike):
         source = os.path.expanduser(source)
@@ -62,5 +62,5 @@ def open_episodes(
 
 
 def recognise(source: Source | ReplayBuffer) -> str | None:
-    """The name in `FORMATS` that a source looks like; None for none, and for our own datasets."""
+    """Return the recognised name in `FORMATS`, None if there is none or for our own datasets."""
     return "sb3" if isinstance(source, ReplayBuffer) else recognise_path(source)

@@ -20,7 +20,7 @@ SUFFIXES = (".hdf5", ".h5", ".he5", ".hdf")
 
 
 class Hdf5Episodes(TableEpisodes):
-    """The episodes of an HDF5 file, or of all in a folder; `TableEpisodes` has the options.
+    """The episodes of an HDF5 file, or of all files in a folder; see `TableEpisodes` for options.
 
     A folder is searched for `.hdf5` and `.h5` files.
     """
@@ -53,7 +53,7 @@ class Hdf5Episodes(TableEpisodes):
         return arrays
 
     def _task(self, file: Path) -> str | None:
-        """LIBERO's instruction, or the name of robomimic's environment."""
+        """Return LIBERO's instruction, or the name of robomimic's environment."""
         attributes = self._handle["data"].attrs if "data" in self._handle else {}
         for attribute, key in (("problem_info", "language_instruction"), ("env_args", "env_name")):
             try:

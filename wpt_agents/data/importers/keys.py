@@ -1,4 +1,4 @@
-"""The words by which files of rows name their arrays, and how a user's key finds one of them."""
+"""The usual names of arrays in files, and the lookup of a user's key."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,12 +10,12 @@ import numpy as np
 IMAGES = ("observations", "observation", "obs", "images", "image", "pixels", "img")
 ACTIONS = ("actions", "action")
 REWARDS = ("rewards", "reward")
-# The flags by which a row may say that its action was an episode's last.
+# The flags that mark an episode's last action.
 TERMINAL = ("terminals", "terminations", "terminated", "terminal")  # the task ended
 TIMEOUT = ("timeouts", "truncations", "truncated", "timeout")  # the time limit was reached
 EITHER = ("dones", "done")
 ENDS = (*TERMINAL, *TIMEOUT, *EITHER, "step_type", "episode_ends")
-# Where known programs keep their cameras. Others are named by the user.
+# The camera names of known programs. The user names any others.
 CAMERAS = re.compile(r"(observations/images/.*|obs/.*_(image|rgb)|(img|camera_?\d+(_rgb)?))")
 MAIN_CAMERAS = ("agentview_image", "agentview_rgb")  # robomimic's and LIBERO's view of the scene
 
@@ -24,7 +24,7 @@ Table = Mapping[str, Any]  # arrays by name: of NumPy, h5py or zarr
 
 @dataclass(frozen=True)
 class Keys:
-    """Which arrays make an episode."""
+    """The names of the arrays that make up an episode."""
 
     image: str
     actions: tuple[str, ...]
@@ -34,12 +34,12 @@ class Keys:
 
 
 def leaf(name: str) -> str:
-    """The last part of a path."""
+    """Return the last part of a path."""
     return name.rsplit("/", 1)[-1]
 
 
 def match(key: str, names: Iterable[str]) -> str | None:
-    """The name that `key` means: itself, or the only one that ends with it."""
+    """Return the name that `key` refers to: itself, or the only name that ends with it."""
     names = list(names)
     if key in names:
         return key
@@ -48,25 +48,25 @@ def match(key: str, names: Iterable[str]) -> str | None:
 
 
 def first(words: Iterable[str], names: Iterable[str]) -> str | None:
-    """The first of `words` that is a name."""
+    """Return the first of `words` that is a name."""
     names = set(names)
     return next((word for word in words if word in names), None)
 
 
 def count(array: Any) -> int:
-    """The number of rows; not every library's arrays have a `len`."""
+    """Return the number of rows; some libraries' arrays do not support `len`."""
     return int(array.shape[0]) if array.shape else 0
 
 
 def is_images(array: Any) -> bool:
-    """Whether an array has the shape of images: (N, H, W, C) or (N, C, H, W), or grayscale."""
+    """Return whether the shape is that of images: (N, H, W, C), (N, C, H, W), or grayscale."""
     return len(array.shape) == 4 or (len(array.shape) == 3 and array.dtype == np.uint8)
 
 
 def find_keys(table: Table, image_key: str | None, action_keys: tuple[str, ...]) -> Keys:
     """Find images, actions and rewards by the user's keys, or by the usual words.
 
-    :raises ValueError: they are not there, or not unique; names what is there
+    :raises ValueError: if they are missing or ambiguous; lists the arrays
     """
     image, others = _find_images(table, image_key)
     head, _, tail = image.partition("/")
@@ -81,15 +81,15 @@ def find_keys(table: Table, image_key: str | None, action_keys: tuple[str, ...])
 
 
 def find_actions(table: Table, action_keys: tuple[str, ...]) -> tuple[str, ...]:
-    """The names of the arrays of actions, in the order of the keys.
+    """Return the names of the action arrays, in the order of the keys.
 
-    :raises ValueError: one is not there; names what might be meant
+    :raises ValueError: if one is missing; suggests similar names
     """
     if not action_keys:
         name = first(ACTIONS, table)
         if name is None:
             parts = [n for n in table if re.match(r"actions?([/_]|$)", n)]
-            what = f"give action_key, one or several of: {', '.join(parts or table)}"
+            what = f"pass action_key, one or several of: {', '.join(parts or table)}"
             raise ValueError(f"there is no array 'actions' or 'action'; {what} (--action-key)")
         return (name,)
     names = [match(key, table) for key in action_keys]
@@ -109,7 +109,7 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
         if name is None:
             raise ValueError(f"needs an array {image_key!r}; there are: {', '.join(table)}. {ask}")
         return name, ()
-    # the usual names come first; cameras are looked for only where there is none
+    # the usual names come first; cameras are searched only if there is none
     name = first(IMAGES, table)
     if name is not None and (name in pictures or name not in IMAGES[:3] or not pictures):
         return name, ()
@@ -121,19 +121,19 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
     for choice in (cameras, main):
         if len(choice) == 1:
             return choice[0], tuple(name for name in cameras if name != choice[0])
-    raise ValueError(f"the images are under no usual name; {ask}")
+    raise ValueError(f"the images have no usual name; {ask}")
 
 
 def natural(name: object) -> list[tuple[int, str | int]]:
-    """A key to sort by in which demo_2 comes before demo_10."""
+    """Return a sort key that puts demo_2 before demo_10."""
     parts = re.split(r"(\d+)", str(name))
     return [(1, int(part)) if part.isdigit() else (0, part) for part in parts]
 
 
 def by_group(table: Table, action_keys: tuple[str, ...]) -> dict[str, Table]:
-    """The tables of groups that are an episode each, such as data/demo_0, in numeric order.
+    """Return the groups that are one episode each, such as data/demo_0, in numeric order.
 
-    Such a group has a number at its end and holds actions.
+    The name of such a group ends with a number, and the group contains actions.
     """
     groups: dict[str, dict[str, Any]] = {}
     for name, array in table.items():
@@ -150,5 +150,5 @@ def by_group(table: Table, action_keys: tuple[str, ...]) -> dict[str, Table]:
 
 
 def within(key: str, groups: Iterable[str]) -> str:
-    """A key without the group it begins with: what names an array of demo_0 is meant for all."""
+    """Remove the episode's group from a key: a key for demo_0 applies to all episodes."""
     return next((key[len(g) + 1 :] for g in groups if key.startswith(g + "/")), key)

@@ -1,7 +1,7 @@
 """LeRobot datasets of version 3: parquet tables, and mp4 videos or images in the tables.
 
 Row t holds observation t and the action taken at it. There is no observation after the last action,
-so that action is left out, and no terminal state is seen.
+so that action is dropped, and no terminal state is seen.
 """
 
 import io
@@ -22,9 +22,10 @@ class LeRobotEpisodes(Episodes):
     """A dataset's episodes; actions are rescaled from the limits in its statistics to [-1, 1].
 
     :param folder: with `meta/info.json`
-    :param camera: the camera, if there are several, as `image_key`; its last part is enough
-    :param options: those of `Episodes`; `low` and `high` replace the least and greatest actions in
-        the statistics
+    :param camera: the camera, if there are several; the same as `image_key`. The last part of its
+        name is enough
+    :param options: those of `Episodes`; `low` and `high` replace the minimum and maximum
+        actions in the statistics
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class LeRobotEpisodes(Episodes):
             chosen = [name for name in cameras if name.endswith(f".{camera}")]
         if len(chosen) != 1:
             raise ValueError(
-                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; give one of: "
+                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; choose one of: "
                 f"{', '.join(cameras) or 'none, it has no images'}"
             )
         return chosen[0]
@@ -80,13 +81,13 @@ class LeRobotEpisodes(Episodes):
         return self.action_keys or ("action",)
 
     def _read_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and greatest actions in the data, by its statistics."""
+        """Return the minimum and maximum actions, from the dataset's statistics."""
         path = self._folder / "meta" / "stats.json"
         stats = json.loads(_text(path)) if path.exists() else {}
         missing = [name for name in self._actions if not {"min", "max"} <= set(stats.get(name, ()))]
         if missing:
             raise ValueError(
-                f"{path} does not say the least and greatest {missing[0]!r}; give the limits of "
+                f"{path} has no minimum and maximum of {missing[0]!r}; pass the limits of "
                 "the actions, low=[...] and high=[...] (--low, --high)"
             )
         low = np.concatenate([np.ravel(stats[name]["min"]) for name in self._actions])
@@ -115,7 +116,9 @@ class LeRobotEpisodes(Episodes):
         source = f"{self._folder.name} episode {row['episode_index']}"
         table = self._table(row)
         if table.num_rows != row["length"]:
-            raise ValueError(f"{source} has {table.num_rows} rows, {row['length']} expected")
+            raise ValueError(
+                f"{source} has {table.num_rows} rows, but {row['length']} are expected"
+            )
         parts = [np.array(table[name].to_pylist(), np.float64) for name in self._actions]
         action = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
         rewarded = "next.reward" in table.schema.names
@@ -132,7 +135,7 @@ class LeRobotEpisodes(Episodes):
         )
 
     def _table(self, row: dict[str, Any]) -> Any:
-        """The episode's rows, in order; the file is kept for the next episode."""
+        """Return the episode's rows in order; the file is cached for the next episode."""
         path = self._folder / self._info["data_path"].format(
             chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
         )
@@ -147,7 +150,7 @@ class LeRobotEpisodes(Episodes):
         return table.take(mine).sort_by("frame_index")
 
     def _pictures(self, table: Any, source: str) -> np.ndarray:
-        """Images in the table, or at paths that are relative to the dataset."""
+        """Return images stored in the table, or at paths relative to the dataset."""
         reader = needs("PIL.Image", "images in LeRobot datasets")
         images = []
         for cell in table[self._camera].to_pylist():
@@ -160,7 +163,7 @@ class LeRobotEpisodes(Episodes):
         return np.concatenate(images)
 
     def _video(self, row: dict[str, Any], table: Any, source: str) -> np.ndarray:
-        """The episode's frames, each resized as soon as it is decoded."""
+        """Return the episode's frames, each resized as soon as it is decoded."""
         prefix = f"videos/{self._camera}/"
         path = self._folder / self._info["video_path"].format(
             video_key=self._camera,
@@ -171,7 +174,7 @@ class LeRobotEpisodes(Episodes):
             np.float64
         )
         images: list[np.ndarray] = []
-        slack = 0.5 / self._info["fps"]  # half a frame: a time stamp may be rounded
+        slack = 0.5 / self._info["fps"]  # half a frame, because time stamps may be rounded
         for time, frame in _frames(path, float(times[0]), slack):
             if len(images) == len(times) or abs(time - times[len(images)]) > slack:
                 break

@@ -1,4 +1,4 @@
-"""Minari datasets. Time is as ours: T + 1 observations, action t taken at observation t."""
+"""Minari datasets. The timing is ours: T + 1 observations, action t taken at observation t."""
 
 import os
 import warnings
@@ -14,7 +14,7 @@ from wpt_agents.data.trajectory import Trajectory
 
 
 def local_minari(name: str) -> Path:
-    """Where Minari keeps the local dataset of this name."""
+    """Return the folder of a local Minari dataset."""
     root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
     return Path(root) / name
 
@@ -24,7 +24,8 @@ class MinariEpisodes(Episodes):
 
     :param name: a local dataset's name (`namespace/name-v0`), its folder, the `data` in it, or a
         MinariDataset
-    :param options: those of `Episodes`; in keys, dots or slashes lead into dictionaries
+    :param options: those of `Episodes`; dots or slashes in keys separate the levels of nested
+        dictionaries
     """
 
     def __init__(self, name: Any, **options: Any) -> None:
@@ -68,20 +69,20 @@ class MinariEpisodes(Episodes):
         )
 
     def _actions(self, key: str, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The actions under a key, and the limits of their space."""
+        """Return the actions under a key, and the limits of their space."""
         space = self._data.action_space
         for part in _parts(key):
             space = space[part] if part in getattr(space, "spaces", {}) else None
         chosen = np.asarray(self._leaf(actions, key, "action_key"))
         if not hasattr(space, "low"):
             raise ValueError(f"{self._name} has the actions {space}; they must be a Box")
-        # several keys become columns side by side, so each is made flat
+        # arrays of several keys are concatenated as columns, so each is flattened
         return chosen.reshape(len(chosen), -1), np.ravel(space.low), np.ravel(space.high)
 
     def _leaf(self, tree: Any, key: str | None, option: str) -> np.ndarray:
-        """What is under a key in nested dictionaries.
+        """Return the array under a key in nested dictionaries.
 
-        :raises ValueError: nothing, or a dictionary
+        :raises ValueError: if there is nothing, or a dictionary
         """
         for part in _parts(key):
             if not isinstance(tree, dict) or part not in tree:
@@ -90,14 +91,14 @@ class MinariEpisodes(Episodes):
             tree = tree[part]
         if isinstance(tree, dict):
             raise ValueError(
-                f"{self._name} has several of them; give {option}, one of: {', '.join(tree)}"
+                f"{self._name} has several arrays; pass {option}, one of: {', '.join(tree)}"
             )
         return np.asarray(tree)
 
 
 @contextmanager
 def _named(what: str) -> Iterator[None]:
-    """Name what is damaged, which the errors of HDF5 and Arrow do not."""
+    """Add the name of the damaged part, which the errors of HDF5 and Arrow lack."""
     try:
         yield
     except (OSError, KeyError, RuntimeError) as error:

@@ -1,7 +1,7 @@
-"""`.npz` files: an episode each (ExORL, URLB, DrQ-v2, the official NCRL data, Dreamer), or rows.
+"""`.npz` files: one per episode (ExORL, URLB, DrQ-v2, the official NCRL data, Dreamer), or rows.
 
-In a file per episode, arrays are T + 1 long, and action t is the one that *led to* observation t:
-the first is a placeholder, as is the first reward. So our action t is their action t + 1.
+In a file per episode, arrays have length T + 1, and action t is the one that *led to* observation
+t: the first action and reward are placeholders. So our action t is their action t + 1.
 
 In a file of rows (OGBench), flags such as `terminals` say where episodes end; action t was taken at
 observation t. Such files are read row by row, never as a whole.
@@ -24,12 +24,12 @@ from wpt_agents.data.trajectory import Trajectory
 # of ExORL and URLB, of Dreamer, of others
 IMAGE_KEYS = ("observation", "image", "pixels")
 OTHERS = ("reward", "discount", "is_terminal", "is_first")
-# all that zipfile and NumPy raise on a damaged file
+# all exceptions that zipfile and NumPy raise for damaged files
 FAULTS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError)
 
 
 class NpzEpisodes(Episodes):
-    """The episodes of a `.npz` file, or of all in a folder and the folders in it, by name.
+    """The episodes of a `.npz` file, or of all files below a folder, sorted by name.
 
     :param folder: searched for `.npz` files; those without actions and images are skipped
     :param options: those of `Episodes`
@@ -55,13 +55,13 @@ class NpzEpisodes(Episodes):
                 stacklevel=2,
             )
         elif strange:
-            self._files = strange  # so that reading says what they lack
+            self._files = strange  # so that the error of reading says what they lack
         warn_left_out(list(kinds.values()).count("single"), folder)
 
     def _kind(self, file: Path) -> str:
-        """What a file is: an "episode", "single" for one of a single image, "flat", or "other".
+        """Return the kind of a file: "episode", "single" (of one image), "flat" or "other".
 
-        What is damaged counts as an episode, so that reading it names it.
+        Damaged files count as episodes, so that reading them raises an error that names them.
         """
         if is_flat(file):
             return "flat"
@@ -102,23 +102,24 @@ class NpzEpisodes(Episodes):
         )
 
     def _actions(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
-        """The actions without the placeholder, several arrays side by side."""
+        """Return the actions without the placeholder; several arrays are concatenated."""
         actions = [np.asarray(arrays[name][1:]) for name in self._action_keys]
         if len(actions) == 1:
             return actions[0]
         return np.concatenate([a.reshape(len(a), -1) for a in actions], axis=1)
 
     def _labels(self, file: Path) -> dict[str, Any]:
-        """What the file's path says of robot and task, where nothing else was asked for."""
+        """Return robot and task as the file's path names them, unless the user set them."""
         return {}
 
     def _done_keys(self) -> tuple[str, ...]:
         return () if self.done_key is None else (self.done_key,)
 
     def _check(self, file: Path, arrays: dict[str, np.ndarray]) -> str:
-        """The images' key.
+        """Return the images' key.
 
-        :raises ValueError: an array is missing or of another length, or there are several episodes
+        :raises ValueError: if an array is missing or has another length, or if there are several
+            episodes
         """
         key = next((key for key in self._image_keys if key in arrays), None)
         needed = (*self._action_keys, *self._done_keys())
@@ -136,14 +137,14 @@ class NpzEpisodes(Episodes):
                 )
         if arrays.get("is_first", np.zeros(1))[1:].any():
             raise ValueError(
-                f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
+                f"{file} contains parts of several episodes (is_first), as DreamerV3's chunks do; "
                 "write one file per episode"
             )
         return key
 
 
 class FlatNpz(TableEpisodes):
-    """The episodes of `.npz` files of rows."""
+    """The episodes of `.npz` files that contain rows."""
 
     _archive: zipfile.ZipFile | None = None
 
@@ -163,7 +164,7 @@ class FlatNpz(TableEpisodes):
 
 
 class Member:
-    """An array in an `.npz` archive of which rows are read; quick if they are read in order.
+    """An array in an `.npz` archive that is read row by row; fast if rows are read in order.
 
     :ivar shape: of the whole array
     :ivar dtype: of its numbers
@@ -197,7 +198,7 @@ class Member:
 
 
 def is_flat(file: Path) -> bool:
-    """Whether a file holds rows of many episodes, whose ends are flagged."""
+    """Return whether a file contains rows of many episodes, with flags at their ends."""
     try:
         names = names_of(file)
     except ValueError:
@@ -206,7 +207,7 @@ def is_flat(file: Path) -> bool:
 
 
 def names_of(file: Path) -> list[str]:
-    """The names of the arrays in a file."""
+    """Return the names of the arrays in a file."""
     try:
         with zipfile.ZipFile(file) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
@@ -215,7 +216,7 @@ def names_of(file: Path) -> list[str]:
 
 
 def arrays_of(file: Path, names: set[str]) -> dict[str, np.ndarray]:
-    """Some arrays of a file, in memory."""
+    """Load some arrays of a file."""
     try:
         with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files if name in names}

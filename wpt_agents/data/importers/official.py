@@ -1,6 +1,6 @@
 """The data that the paper's authors publish: `ncrl_datasets/<suite>/<domain or task>/*.npz`.
 
-Files are those of `NpzEpisodes`, one an episode, named `{time}-{id}-{number}-{length}.npz`. The
+Files are those of `NpzEpisodes`, one per episode, named `{time}-{id}-{number}-{length}.npz`. The
 folders are the labels: DMControl's are robots, Meta-World's are tasks of one robot.
 """
 
@@ -21,7 +21,7 @@ class OfficialEpisodes(NpzEpisodes):
     Actions beyond [-1, 1] are clipped, as the simulators did when the episodes were recorded.
 
     :param folder: `ncrl_datasets`, or one of the folders in it
-    :raises ValueError: a folder that is not inside `dmcontrol` or `metaworld`, nor has them
+    :raises ValueError: if the folder is neither inside `dmcontrol` or `metaworld` nor contains them
     """
 
     def __init__(self, folder: str | os.PathLike[str], **options: Any) -> None:
@@ -33,7 +33,7 @@ class OfficialEpisodes(NpzEpisodes):
         super().__init__(folder, **options)
 
     def _kind(self, file: Path) -> str:
-        length = file.stem.rpartition("-")[2]  # tens of thousands of files are not opened for it
+        length = file.stem.rpartition("-")[2]  # avoids opening tens of thousands of files
         if not length.isdecimal():
             return super()._kind(file)
         return "episode" if int(length) > 0 else "single"
@@ -53,14 +53,14 @@ class OfficialEpisodes(NpzEpisodes):
 
 
 def is_official(folder: str | os.PathLike[str]) -> bool:
-    """Whether a folder is one of the authors' suites, has them in it, or is in one of them."""
+    """Return whether a folder is one of the authors' suites, contains one, or is inside one."""
     path = Path(folder)
     inside = any((path / suite).is_dir() for suite in SUITES)
     return inside or bool(_below_suite(path))
 
 
 def _below_suite(folder: Path) -> list[str]:
-    """The names on the way down to `folder`, from the last one that is a suite's."""
+    """Return the parts of the path of `folder`, from the last one that names a suite."""
     parts = Path(os.path.abspath(folder)).parts
     suites = [i for i, part in enumerate(parts) if part in SUITES]
     return list(parts[suites[-1] :]) if suites else []

@@ -1,4 +1,4 @@
-"""What a path holds: one of the formats that can be read, or something else that has a name."""
+"""Recognise the format of a path, or describe what else it contains."""
 
 import difflib
 import os
@@ -19,7 +19,7 @@ IMPORT = "python -m wpt_agents.zoo import"
 
 
 def recognise_path(source: str | os.PathLike[str]) -> str | None:
-    """The format that a path looks like; None for none, and for our own datasets."""
+    """Return the recognised format, None if there is none or for our own datasets."""
     path = Path(source)
     if (path / "meta.json").exists():
         return None
@@ -56,12 +56,12 @@ def _folder_format(path: Path) -> str | None:
 
 
 def _model_in(folder: Path) -> Path | None:
-    """A model file that stands in the folder itself, as in the folder of a run."""
+    """Return a model file directly in the folder, as in the folder of a run."""
     return next((file for file in sorted(folder.glob("*.zip")) if model_kind(file)), None)
 
 
 def model_kind(file: Path) -> str | None:
-    """Whose model a zip file is; None for other files."""
+    """Return the library that wrote a model file, None for other files."""
     try:
         with zipfile.ZipFile(file) as archive:
             names = archive.namelist()
@@ -73,7 +73,7 @@ def model_kind(file: Path) -> str | None:
 
 
 def refusal(source: str | os.PathLike[str], formats: str) -> ValueError:
-    """The error for a path that is no dataset and no known format: what it is and what to do.
+    """Return the error for a path that is no dataset and has no known format.
 
     :param formats: the names of the formats that can be imported
     """
@@ -129,7 +129,7 @@ def _file(path: Path, formats: str) -> str:
         )
     if suffix in (".pkl", ".pickle"):
         return (
-            f"is a pickle ({suffix}), which runs whatever code is in it: if it is a replay buffer "
+            f"is a pickle ({suffix}), and loading it can run any code: if it is a replay buffer "
             f"of SB3 that you trust, convert it by `{IMPORT} sb3 {path} DST --trust`; otherwise "
             "make a Trajectory of each episode"
         )

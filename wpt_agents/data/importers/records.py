@@ -1,8 +1,8 @@
 """TFRecord files, whose records are a `tf.train.Example` each, read without TensorFlow.
 
 A record is its length (8 bytes), 4 bytes of checksum, the data and 4 more; an Example is a protocol
-buffer of named lists of bytes, floats or integers. The checksums are not verified; a file that is
-cut short or an image that is damaged is found anyway.
+buffer of named lists of bytes, floats or integers. The checksums are not verified; truncated
+files and damaged images are detected anyway.
 """
 
 import struct
@@ -17,9 +17,9 @@ GZIP, ZLIB = b"\x1f\x8b", b"\x78\x9c"
 
 
 def find_records(file: Path) -> Iterator[tuple[int, int, bool]]:
-    """Yield where each record's data begin, their length, and whether the episode is one step.
+    """Yield the offset and length of each record's data, and whether the episode has one step.
 
-    :raises ValueError: a file that is cut short or compressed
+    :raises ValueError: if the file is truncated or compressed
     """
     end = file.stat().st_size
     at = 0
@@ -45,7 +45,7 @@ def find_records(file: Path) -> Iterator[tuple[int, int, bool]]:
 
 
 def _is_single(data: memoryview) -> bool:
-    """Whether an episode has one step. Its images are skipped, and damage is found later."""
+    """Return whether an episode has one step. Images are skipped, and damage is detected later."""
     try:
         for name, feature in _features(data):
             if name == "steps/is_first":
@@ -65,21 +65,21 @@ def _features(data: memoryview) -> Iterator[tuple[str, memoryview]]:
 
 
 def read_steps(data: bytes, source: str) -> dict[str, Any]:
-    """The lists of an episode's steps by name: bytes as a list, numbers as an array."""
+    """Return the lists of an episode's steps by name: bytes as a list, numbers as an array."""
     steps: dict[str, Any] = {}
     try:
         for name, feature in _features(memoryview(data)):
             if name.startswith("steps/"):
                 steps |= {name[6:]: _values(*field) for field in _fields(feature)}
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise ValueError(f"{source} is damaged or no tf.train.Example: {error}") from error
+        raise ValueError(f"{source} is damaged or not a tf.train.Example: {error}") from error
     if not steps:
         raise ValueError(f"{source} holds no 'steps/...': it is no RLDS episode")
     return steps
 
 
 def _values(kind: int, data: memoryview) -> Any:
-    """A BytesList, FloatList or Int64List, packed as TensorFlow writes them or not."""
+    """Read a BytesList, FloatList or Int64List, packed (as TensorFlow writes them) or not."""
     values = [value for _, value in _fields(data)]
     if kind == 1:
         return [bytes(value) for value in values]
@@ -117,7 +117,7 @@ def _fields(data: memoryview) -> Iterator[tuple[int, Any]]:
 
 
 def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    """The base-128 number at `at`, and where the next field begins."""
+    """Return the base-128 number at `at`, and the offset after it."""
     value = 0
     shift = 0
     while True:

@@ -1,7 +1,7 @@
-"""RLDS episodes as TFDS stores them, Open X-Embodiment's for example; TensorFlow is not needed.
+"""RLDS episodes as TFDS stores them, for example Open X-Embodiment; TensorFlow is not needed.
 
-Step t holds observation t and the action taken at it, with the reward it brought. The last step's
-action means nothing (`is_last`), so that T + 1 steps are T actions and T + 1 images.
+Step t holds observation t and the action taken at it, and the resulting reward. The
+action of the last step (`is_last`) is meaningless, so T + 1 steps are T actions and T + 1 images.
 """
 
 import io
@@ -17,10 +17,10 @@ from wpt_agents.data.importers.episodes import Episodes, as_images, needs, warn_
 from wpt_agents.data.importers.records import find_records, read_steps
 from wpt_agents.data.trajectory import Trajectory
 
-JPEG = b"\xff\xd8"  # how every JPEG file begins
-# The parts of a dictionary of actions, in the order in which Open X-Embodiment's users put them
-# side by side: where the hand goes, how it turns, what the fingers do. Flags that end an episode
-# and motions of a wheeled base are no part of it.
+JPEG = b"\xff\xd8"  # the first bytes of every JPEG file
+# The parts of a dictionary of actions, in the order in which Open X-Embodiment's users concatenate
+# them: translation, rotation and gripper. Flags that end an episode and motions of a wheeled base
+# are not included.
 ORDER = ("world_vector", "rotation_delta", "gripper_closedness_action", "open_gripper")
 INSTRUCTIONS = (
     *("language_instruction", "observation/natural_language_instruction"),
@@ -29,11 +29,11 @@ INSTRUCTIONS = (
 
 
 class RldsEpisodes(Episodes):
-    """The episodes of one TFRecord file, or of all in a folder and the folders in it, by name.
+    """The episodes of one TFRecord file, or of all files below a folder, sorted by name.
 
-    The language instruction becomes the task, unless `task` is set. Of a dictionary of actions,
-    name the parts: `action_key=["action/world_vector", "action/rotation_delta"]`; or all by
-    `action_key="action"`, in the order of `ORDER`.
+    The language instruction becomes the task, unless `task` is set. If actions are a dictionary,
+    name its parts: `action_key=["action/world_vector", "action/rotation_delta"]`, or use all of them
+    with `action_key="action"`, in the order of `ORDER`.
 
     :param folder: one version of a dataset, or a TFRecord file
     :param split: only files of this split, `train` for example
@@ -86,21 +86,21 @@ class RldsEpisodes(Episodes):
         raise ValueError(f"{source} has no {key!r} in its steps; there are: {', '.join(steps)}")
 
     def _actions(self, steps: dict[str, Any], count: int, source: str) -> np.ndarray:
-        """(T + 1, A), the parts side by side."""
+        """Return (T + 1, A), the concatenated parts."""
         names = self.action_keys or ("action",)
         parts = [name for name in steps if name.startswith("action/")]
         ordered = [f"action/{name}" for name in ORDER if f"action/{name}" in parts]
         if names == ("action",) and "action" not in steps and parts:
             if not self.action_keys:
                 raise ValueError(
-                    f"{source} has a dictionary of actions; give action_key, several of its parts, "
-                    f"which are put side by side: {','.join(ordered or parts)} (--action-key). "
+                    f"{source} has a dictionary of actions; pass action_key, some of its parts, "
+                    f"which are concatenated: {','.join(ordered or parts)} (--action-key). "
                     f"There are: {', '.join(parts)}"
                 )
             names = tuple(ordered)
             if not names:
                 raise ValueError(
-                    f"{source} has no action of a known name; give action_key, several of: "
+                    f"{source} has no action with a known name; pass action_key, one or more of: "
                     f"{', '.join(parts)}"
                 )
         arrays = [np.asarray(self._find(steps, name, source)) for name in names]
@@ -110,7 +110,7 @@ class RldsEpisodes(Episodes):
         return np.concatenate(columns, axis=1)
 
     def _images(self, steps: dict[str, Any], source: str) -> np.ndarray:
-        """The episode's images, each resized as soon as it is decoded."""
+        """Return the episode's images, each resized as soon as it is decoded."""
         encoded = self._encoded(steps, source)
         if encoded[0].startswith(JPEG) and not self._warned:
             self._warned = True
@@ -126,9 +126,9 @@ class RldsEpisodes(Episodes):
         return np.concatenate(images)
 
     def _encoded(self, steps: dict[str, Any], source: str) -> list[bytes]:
-        """The images' files.
+        """Return the encoded images.
 
-        :raises ValueError: there are none, or several and none is chosen
+        :raises ValueError: if there are none, or several and none is chosen
         """
         pictures = sorted(
             k for k, v in steps.items() if isinstance(v, list) and v and _is_picture(v[0])
@@ -152,7 +152,7 @@ def _is_picture(data: bytes) -> bool:
 
 
 def _instruction(steps: dict[str, Any]) -> str | None:
-    """The language instruction of the episode's first step, if there is one."""
+    """Return the language instruction of the episode's first step, if there is one."""
     for name in INSTRUCTIONS:
         values = steps.get(name)
         if isinstance(values, list) and values and values[0]:

@@ -1,9 +1,9 @@
-"""Arrays of rows, cut into episodes: what HDF5, .npz and zarr files have in common.
+"""Arrays of rows that are split into episodes, for HDF5, .npz and zarr files.
 
 Row t holds observation t and the action taken at it, unless the file is in dm_env's convention
 (`step_type`), where row t holds the action that *led to* observation t and an episode's first
-action is a placeholder. The observation after an episode's last action is there only if the images
-have a companion `next_...`; without it that action is left out, and no terminal state is seen.
+action is a placeholder. The observation after an episode's last action exists only if there is also
+an array `next_...` of images; without it that action is dropped, and no terminal state is seen.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ FIRST, LAST = 0, 2  # dm_env's step types
 
 @dataclass(frozen=True)
 class Cut:
-    """How a table is cut into episodes.
+    """The split of a table into episodes.
 
     :param bounds: the first row of each episode and one past its last
     :param shifted: whether row t holds the action that led to observation t
-    :param left_out: how many episodes were too short to hold an action
+    :param left_out: the number of episodes that are too short to contain an action
     """
 
     bounds: tuple[tuple[int, int], ...]
@@ -33,9 +33,9 @@ class Cut:
 
 
 def length(table: Table, columns: Keys) -> int:
-    """The number of rows, that of the actions.
+    """Return the number of rows, which is the number of actions.
 
-    :raises ValueError: images and actions are not equally many
+    :raises ValueError: if the numbers of images and actions differ
     """
     rows = count(table[columns.actions[0]])
     images = count(table[columns.image])
@@ -48,9 +48,9 @@ def length(table: Table, columns: Keys) -> int:
 
 
 def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None) -> Cut:
-    """Find where episodes end, by the user's key or the usual flags.
+    """Find the ends of episodes by the user's key or the usual flags.
 
-    :raises ValueError: there is no such flag, or the timing of `step_type` is not clear
+    :raises ValueError: if there is no such flag, or the timing of `step_type` is ambiguous
     """
     rows = length(table, columns)
     names = [done_key] if done_key is not None else [n for n in keys.ENDS if n in table]
@@ -66,14 +66,14 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
     edges = np.unique(np.concatenate([[0], ends, [rows]]).astype(int)).tolist()
     if shifted is None:
         shifted = "step_type" in names and _first_actions_are_empty(table, columns, edges)
-    # without a next image an episode's last action leads nowhere
+    # without a next image the outcome of an episode's last action is unknown
     shortest = 1 if columns.next_image and not shifted else 2
     bounds = tuple((a, b) for a, b in pairwise(edges) if b - a >= shortest)
     return Cut(bounds, shifted, len(edges) - 1 - len(bounds))
 
 
 def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
-    """One past the last row of each episode."""
+    """Return one past the last row of each episode."""
     if keys.leaf(name) == "episode_ends" or len(flags) != rows:
         if len(flags) and (np.any(np.diff(flags) <= 0) or flags[-1] > rows):
             raise ValueError(
@@ -87,19 +87,19 @@ def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
 
 
 def _first_actions_are_empty(table: Table, columns: Keys, edges: list[int]) -> bool:
-    """Whether every episode's first action is a placeholder, as in dm_env's convention."""
+    """Return whether every episode's first action is a placeholder, as in dm_env's convention."""
     action = read_actions(table, columns, 0, edges[-1])[edges[:-1]]
     if not np.nan_to_num(action).any():
         return True
     raise ValueError(
         "'step_type' comes from dm_env, where the action of a row led to its observation and the "
-        "first action of an episode is zero, but here it is not: say shifted=True if it did "
+        "first action of an episode is zero, but here it is not: pass shifted=True if it did "
         "(--shifted), or shifted=False if the action was taken at the observation (--no-shifted)"
     )
 
 
 def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarray:
-    """The actions of some rows, several arrays side by side: (stop - start, A)."""
+    """Return the actions of some rows, (stop - start, A); several arrays are concatenated."""
     if len(columns.actions) == 1:
         return np.asarray(table[columns.actions[0]][start:stop])
     parts = [np.asarray(table[name][start:stop]) for name in columns.actions]
@@ -109,7 +109,7 @@ def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarr
 def episode(
     table: Table, columns: Keys, start: int, stop: int, shifted: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
-    """Images, actions, rewards and whether the end is a terminal state, of some rows, as ours."""
+    """Return images, actions, rewards and the terminal flag of some rows in our convention."""
     image = np.asarray(table[columns.image][start:stop])
     action = read_actions(table, columns, start, stop)
     reward = None if columns.reward is None else np.asarray(table[columns.reward][start:stop])
@@ -127,7 +127,7 @@ def episode(
 def whole(
     table: Table, columns: Keys, where: str, shifted: bool | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
-    """The one episode of a table, with as many images as actions or one more."""
+    """Return the only episode of a table, with as many images as actions or one more."""
     rows = count(table[columns.actions[0]])
     images = count(table[columns.image])
     if images == rows + 1:

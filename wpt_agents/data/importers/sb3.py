@@ -2,7 +2,7 @@
 
 Action t was taken at observation t, and is in [-1, 1] already: SB3 stores it rescaled. With
 `optimize_memory_usage` the observation after an episode's last action is overwritten, so that
-action is left out, and no terminal state is seen.
+action is dropped, and no terminal state is seen.
 """
 
 import os
@@ -24,7 +24,7 @@ class SB3Episodes(Episodes):
     """A replay buffer's episodes, environment by environment, oldest first.
 
     :param buffer: in memory, or a file of `model.save_replay_buffer`
-    :param trust: load a file; SB3's are pickles, which run whatever code is in them
+    :param trust: load a file; SB3's files are pickles, which can run any code
     :param options: those of `Episodes`; `image_key` chooses from dictionary observations
     """
 
@@ -37,7 +37,9 @@ class SB3Episodes(Episodes):
         super().__init__(**options)
         self._refuse_done_key("SB3")
         if self.action_keys:
-            raise ValueError("SB3's replay buffers have one array of actions; leave action_key out")
+            raise ValueError(
+                "SB3's replay buffers have only one array of actions; leave action_key out"
+            )
         if isinstance(buffer, str | os.PathLike):
             buffer = _load(buffer, trust)
         if not isinstance(buffer, ReplayBuffer):
@@ -48,16 +50,18 @@ class SB3Episodes(Episodes):
         self._limits = buffer.action_space.low, buffer.action_space.high
         self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
         first = buffer.pos if buffer.full else 0
-        # from the oldest on: a full ring begins where the next step would be written
+        # from the oldest row: in a full ring it is the one to be overwritten next
         self._rows = (first + np.arange(buffer.size())) % buffer.buffer_size
         if self._overwritten and buffer.full:
-            self._rows = self._rows[1:]  # the oldest holds the newest's next observation
+            self._rows = self._rows[
+                1:
+            ]  # the oldest row contains the next observation of the newest
         self._bounds = [b for env in range(buffer.n_envs) for b in self._find_bounds(env)]
         if not self._bounds:
             raise ValueError("The replay buffer holds no episode")
 
     def _find_bounds(self, env: int) -> list[tuple[int, int, int]]:
-        """Environment, first row in order of age, and one past the last, for each episode."""
+        """Return the environment, the first row by age, and one past the last, for each episode."""
         ends = np.flatnonzero(self._buffer.dones[self._rows, env]) + 1
         cuts = [0], ends, self._find_resets(env), [len(self._rows)]
         edges = np.unique(np.concatenate(cuts).astype(int)).tolist()
@@ -67,7 +71,7 @@ class SB3Episodes(Episodes):
         return bounds
 
     def _find_resets(self, env: int) -> list[int]:
-        """The rows whose observation the step before did not lead to: `learn` began again."""
+        """Return the rows at which `learn` was called again, after an unfinished episode."""
         if self._overwritten:
             return []
         seen = self._images(self._buffer.observations)
@@ -88,7 +92,7 @@ class SB3Episodes(Episodes):
         else:
             last = self._images(buffer.next_observations)[rows[-1:], env]
             image = np.concatenate([image, last])
-            # a time limit is no terminal state
+            # a time limit is not a terminal state
             over = buffer.dones[rows[-1], env] and not buffer.timeouts[rows[-1], env]
             terminated = bool(over)
         source = f"SB3 replay buffer, environment {env}, steps {start} to {stop - 1}"

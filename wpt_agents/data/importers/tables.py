@@ -1,4 +1,4 @@
-"""Files of arrays, HDF5 or zarr: flat rows, a group per episode, or a file per episode."""
+"""Files of arrays (HDF5, zarr): flat rows, a group per episode, or a file per episode."""
 
 import os
 import warnings
@@ -25,7 +25,7 @@ from wpt_agents.data.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Place:
-    """Where an episode is: a file, a group in it, and rows; None for the whole group."""
+    """The location of an episode: a file, a group in it, and rows (None: the whole group)."""
 
     file: Path
     group: str
@@ -36,11 +36,11 @@ class Place:
 
 
 class TableEpisodes(Episodes):
-    """The episodes of files of arrays, file by file.
+    """The episodes in files of arrays, file by file.
 
     :param path: a file, or a folder whose files are read in their numeric order
     :param shifted: whether row t holds the action that led to observation t, as in dm_env's
-        convention, and not the one that was taken at it; found out for `step_type` if None
+        convention, instead of the one that was taken at it; inferred for `step_type` if None
     """
 
     def __init__(
@@ -63,9 +63,9 @@ class TableEpisodes(Episodes):
         warn_left_out(left_out, path)
 
     def _list(self, path: Path) -> Sequence[Path]:
-        """The files to read.
+        """Return the files to read.
 
-        :raises ValueError: there are none
+        :raises ValueError: if there are none
         """
         if not path.exists():
             raise ValueError(f"{path} does not exist")
@@ -73,10 +73,10 @@ class TableEpisodes(Episodes):
 
     @abstractmethod
     def _read(self, file: Path) -> Table:
-        """All arrays of a file by their paths in it."""
+        """Return all arrays of a file by their paths in it."""
 
     def _task(self, file: Path) -> str | None:
-        """The task of a file's episodes, if the file says it."""
+        """Return the task of a file's episodes, if the file names it."""
         return None
 
     def _table(self, file: Path) -> Table:
@@ -85,7 +85,7 @@ class TableEpisodes(Episodes):
         return self._opened[1]
 
     def _find(self, file: Path, several: bool) -> int:
-        """Add the places of a file's episodes; the number of those that hold no action."""
+        """Add the locations of a file's episodes; return the number of those without an action."""
         table = self._table(file)
         task = self._task(file)
         groups = by_group(table, self.action_keys)

@@ -1,7 +1,7 @@
 """TD-MPC2's `.pt` files: dictionaries of tensors (episodes, T + 1, ...), saved by torch.
 
 Action t is the one that *led to* observation t, and each episode's first action is NaN: so our
-action t is their action t + 1. Its published data hold states only, which are refused.
+action t is their action t + 1. The published data contain only states, which raise an error.
 """
 
 import os
@@ -19,10 +19,10 @@ from wpt_agents.data.trajectory import Trajectory
 
 
 class TdMpc2Episodes(Episodes):
-    """The episodes of a `.pt` file, or of all in a folder.
+    """The episodes of a `.pt` file, or of all files in a folder.
 
     :param file: a file, or a folder of them
-    :param trust: load a file that is a pickle, which runs whatever code is in it
+    :param trust: load a file that is a pickle, which can run any code
     :param options: those of `Episodes`
     """
 
@@ -52,7 +52,7 @@ class TdMpc2Episodes(Episodes):
                 f"{file} is a pickle of more than tensors (.pt), and loading it runs whatever code "
                 "is in it; if you trust it, say so with trust=True (--trust)"
             ) from error
-        except Exception as error:  # torch raises many kinds on nonsense
+        except Exception as error:  # torch raises many types of exceptions for invalid files
             raise ValueError(f"{file} cannot be read by torch.load: {error}") from error
         if not isinstance(content, Mapping) and not hasattr(content, "keys"):
             raise ValueError(f"{file} holds a {type(content).__name__}, not a dictionary")
@@ -61,9 +61,9 @@ class TdMpc2Episodes(Episodes):
         return loaded
 
     def _find(self, file: Path) -> tuple[Any, list[Any], Any]:
-        """Images, actions and rewards of all episodes of a file: (E, T + 1, ...)."""
+        """Return images, actions and rewards of all episodes of a file: (E, T + 1, ...)."""
         content = self._load(file)
-        names = [str(name) for name in content.keys()]  # a TensorDict iterates rows
+        names = [str(name) for name in content.keys()]  # iterating a TensorDict yields rows
         image = self.image_key or first(IMAGES, names)
         actions = self.action_keys or (first(ACTIONS, names) or "action",)
         for name in (image, *actions):

@@ -13,10 +13,7 @@ from wpt_agents.data.importers.tables import TableEpisodes
 
 
 class ZarrEpisodes(TableEpisodes):
-    """The episodes of a zarr group, a folder or packed into a `.zip`.
-
-    `TableEpisodes` has the options.
-    """
+    """The episodes of a zarr folder or a `.zip` file of one; see `TableEpisodes` for options."""
 
     def _read(self, file: Path) -> Table:
         zarr = needs("zarr", "zarr groups")
@@ -25,7 +22,7 @@ class ZarrEpisodes(TableEpisodes):
             store = zarr.storage.ZipStore(file, mode="r") if zipped else str(file)
             group = zarr.open_group(store, mode="r")
             arrays = dict(_arrays(group, zarr.Array))
-        except Exception as error:  # zarr and its codecs raise many kinds
+        except Exception as error:  # zarr and its codecs raise many types of exceptions
             raise ValueError(f"{file} cannot be read as a zarr group: {error!r}") from error
         return {name.removeprefix("data/").removeprefix("meta/"): a for name, a in arrays.items()}
 

@@ -1,6 +1,6 @@
 """Atomic files: arrays and JSON in one file with checksums, without pickle.
 
-Such a file is a zip without compression; each member carries a checksum that reading verifies.
+Such a file is an uncompressed zip archive; reading verifies the checksum of each member.
 """
 
 import glob
@@ -15,16 +15,17 @@ from typing import IO, Any
 
 import numpy as np
 
-VERSION = 1  # raised when the layout changes: older programs then refuse new files
+VERSION = 1  # increased when the layout changes, so that older versions reject new files
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, which replaces `path` if the block succeeds.
+    """Yield a temporary path that replaces `path` if the block succeeds.
 
-    The file is on the disk (fsync) before it is renamed, so a crash at any moment leaves one of the
-    two whole. A block that raises leaves `path` as it was and nothing beside it. What a killed
-    process left is removed by the next one that writes to `path` on the same machine.
+    The file is synced to disk before it is renamed, so a crash at any moment leaves either the old
+    or the new file complete. If the block raises, `path` is unchanged and the temporary file is
+    deleted. Temporary files of killed processes are removed by the next write to `path` on the
+    same machine.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,27 +42,27 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException as error:
         with suppress(FileNotFoundError):
             temporary.unlink()
-        if isinstance(error, OSError) and error.filename is None:  # as when the disk is full
+        if isinstance(error, OSError) and error.filename is None:  # for example if the disk is full
             error.filename = str(path)
         raise
     sync_folder(path.parent)
 
 
 def _alive(pid: str) -> bool:
-    """Return whether a process of this machine has this number, as far as that can be known."""
-    if os.name == "nt":  # where the signal 0 is Ctrl-C
+    """Return whether a process with this ID exists on this machine; True if that is unknown."""
+    if os.name == "nt":  # on Windows, signal 0 is Ctrl-C
         return True
     try:
         os.kill(int(pid), 0)
     except ProcessLookupError:
         return False
-    except (OSError, ValueError):  # somebody else's process, or a file that is not ours
+    except (OSError, ValueError):  # another user's process, or a file that is not ours
         return True
     return True
 
 
 def sync_folder(folder: Path) -> None:
-    """Force the names in `folder` to the disk, where the system can (not on Windows)."""
+    """Sync the directory entries of `folder` to disk, if the system supports it (not Windows)."""
     if hasattr(os, "O_DIRECTORY"):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -93,7 +94,7 @@ def load_arrays(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a file of `save_arrays` and verify every byte.
 
-    :raises ValueError: a file that is cut short, damaged, of another kind or of a newer version
+    :raises ValueError: if the file is truncated, damaged, of another kind or of a newer version
     """
     try:
         with zipfile.ZipFile(path) as archive:

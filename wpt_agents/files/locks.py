@@ -1,7 +1,7 @@
 """Locks on files by which processes exclude each other.
 
-The kernel releases such a lock when its process ends, however it ends: a killed process leaves no
-stale lock behind. `fcntl` is imported on use, so that reading works on systems without it.
+The kernel releases such a lock when its process ends, so a killed process leaves no stale lock.
+`fcntl` is imported on use, so that reading works on systems without it.
 """
 
 import os
@@ -14,8 +14,8 @@ def lock(descriptor: int, wait: bool = False) -> None:
     """Lock an open file exclusively.
 
     :param wait: block until another holder is done
-    :raises BlockingIOError: another process holds the lock, and `wait` is False
-    :raises OSError: the system or the file system has no such locks
+    :raises BlockingIOError: if another process has the lock and `wait` is False
+    :raises OSError: if the system or the file system has no such locks
     """
     try:
         import fcntl

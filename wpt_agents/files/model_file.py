@@ -17,7 +17,8 @@ from wpt_agents.files.tensors import read_tensors, write_tensors
 KIND, VERSION = "wpt_agents model", 1
 ABOUT, TENSORS = "about.json", ".safetensors"
 FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, EOFError, OSError, KeyError)
-FAULTS += (AttributeError, RuntimeError, TypeError, ValueError)  # of zipfile and json on nonsense
+# zipfile and json raise these for invalid files
+FAULTS += (AttributeError, RuntimeError, TypeError, ValueError)
 
 
 def write_model(
@@ -36,7 +37,7 @@ def write_model(
 def _write(
     file: BufferedIOBase, header: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
-    # ZipInfo has no time of day in it: equal models are equal bytes
+    # ZipInfo without a time stamp: equal models give identical files
     with zipfile.ZipFile(file, "w") as archive:
         head = {"kind": KIND, "version": VERSION, "groups": list(tensors), **header}
         archive.writestr(zipfile.ZipInfo(ABOUT), json.dumps(head, indent=1))
@@ -50,8 +51,8 @@ def read_model(
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     """Read a file of `write_model` and verify every byte.
 
-    :raises FileNotFoundError: no such file
-    :raises ValueError: a file that is cut short, damaged, not ours, or of a newer version
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file is truncated, damaged, of another kind, or of a newer version
     """
     if not isinstance(path, str | os.PathLike):
         return _read(path, "The file")
@@ -86,7 +87,7 @@ def _tensors(archive: zipfile.ZipFile, group: str) -> dict[str, Tensor]:
 
 
 def _members(archive: zipfile.ZipFile) -> list[str]:
-    """The names of the groups of tensors; any other member is refused."""
+    """Return the names of the groups of tensors; raise an error for any other member."""
     names = archive.namelist()
     if ABOUT not in names:
         raise ValueError(f"it has no {ABOUT}: not a model of wpt_agents")
@@ -98,7 +99,7 @@ def _members(archive: zipfile.ZipFile) -> list[str]:
 
 
 def optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
-    """The running averages of an optimiser, named by parameter number and kind."""
+    """Return the running averages of an optimiser, named by parameter number and kind."""
     state = optimizer.state_dict()["state"]
     return {f"{i}.{key}": value for i, group in state.items() for key, value in group.items()}
 

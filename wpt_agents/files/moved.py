@@ -1,4 +1,4 @@
-"""Let the import paths of version 0.1 work for one more version, with a DeprecationWarning.
+"""Keep the import paths of version 0.1 working in this version, with a DeprecationWarning.
 
 `import wpt_agents.policy` finds a module that looks up its names in `wpt_agents.model.policy`.
 """
@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 PACKAGE = "wpt_agents"
-FOLDERS = {  # of version 0.2, and the modules of version 0.1 that are in them under their old names
+FOLDERS = {  # modules of version 0.2, and the names of those of version 0.1 in them
     "data": (
         *("codecs", "convert", "dataset", "images", "importers", "index", "replay", "retrieval"),
         *("shards", "trajectory", "windows"),
@@ -44,7 +44,7 @@ MOVED |= {
 }
 
 
-# Modules of which more than one has come; names are looked up in all of them.
+# Modules that were split into several; names are looked up in all of them.
 SPLIT = {
     f"{PACKAGE}.{old}": tuple(f"{PACKAGE}.{name}" for name in names)
     for old, names in {
@@ -63,16 +63,16 @@ MOVED["wpt_agents.networks"] = "wpt_agents.model.images"
 
 
 def new_modules(old: str) -> list[ModuleType]:
-    """Return the modules that hold the names of an old one."""
+    """Return the modules that contain the names of an old one."""
     return [import_module(name) for name in SPLIT.get(old, (MOVED[old],))]
 
 
 class MovedModule(ModuleType):
-    """Stands at an old path; its names are those of the module at the new path."""
+    """A module at an old path, with the names of the module at the new path."""
 
     def __getattr__(self, name: str) -> Any:
         """Return a name of the module at the new path."""
-        if name.startswith("__"):  # the import system asks for some
+        if name.startswith("__"):  # the import system looks some of them up
             raise AttributeError(name)
         for module in new_modules(self.__name__):
             if hasattr(module, name):
@@ -85,12 +85,12 @@ class MovedModule(ModuleType):
 
 
 class MovedFinder(MetaPathFinder, Loader):
-    """Finds the modules of version 0.1."""
+    """A finder for the modules of version 0.1."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec for an old path, None for any other."""
+        """Return a spec for an old path, None for any other path."""
         if fullname not in MOVED:
             return None
         return ModuleSpec(fullname, self, is_package=fullname == "wpt_agents.importers")
@@ -110,6 +110,6 @@ class MovedFinder(MetaPathFinder, Loader):
 
 
 def install() -> None:
-    """Let the import system find old paths, after all others."""
+    """Add the finder of old paths to the import system, after all others."""
     if not any(isinstance(finder, MovedFinder) for finder in sys.meta_path):
         sys.meta_path.append(MovedFinder())

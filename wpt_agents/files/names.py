@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 def unknown_name(kind: str, name: object, valid: Iterable[str]) -> ValueError:
-    """The error for an unknown name, with similar names and all valid ones."""
+    """Return the error for an unknown name, with similar names and all valid ones."""
     names = sorted(valid)
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
@@ -13,5 +13,5 @@ def unknown_name(kind: str, name: object, valid: Iterable[str]) -> ValueError:
 
 
 def counted(number: int, noun: str) -> str:
-    """'1 task', '2,000 tasks'."""
+    """Return a number with its noun: '1 task', '2,000 tasks'."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from wpt_agents.files.archive import replacing
 
-GATES, NORM_EPS = "across", 1e-5  # how the authors' GRU orders its gates; PyTorch's default eps
-STOCH, UNITS = 32, 512  # the authors' configurations; the shapes do not say them in every file
+GATES, NORM_EPS = "across", 1e-5  # the gate order of the authors' GRU; PyTorch's default eps
+STOCH, UNITS = 32, 512  # from the authors' configurations: shapes may not determine them
 FAULTS = (zipfile.BadZipFile, RuntimeError, EOFError, OSError, ValueError, KeyError, TypeError)
 
 
@@ -75,7 +75,7 @@ DECODER = {
     **_convolutions(4, 3),
 }
 WORLD_MODEL = ("wm.encoder", "wm.rssm", "wm.decoder")
-# For each part of a file: the module of `WPTPolicy` that it holds, and our names of its layers.
+# For each part of a file: the corresponding module of `WPTPolicy`, and our names of its layers.
 PARTS: dict[str, tuple[str, dict[str, str]]] = {
     "wm.encoder": ("world_model.encoder", _convolutions(4, 4)),
     "wm.rssm": ("world_model.rssm", RSSM),
@@ -88,7 +88,7 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
 
 
 class Official(NamedTuple):
-    """What a file of the authors holds.
+    """The content of a model file of the paper's authors.
 
     :param size: the fields of a `Size`, inferred from the shapes
     :param max_action_dim: the padded action width; 21 in the published files
@@ -101,7 +101,7 @@ class Official(NamedTuple):
 
 
 def parameter_names(part: str) -> Iterator[tuple[str, str]]:
-    """Each parameter's name in a part of the authors' file, and in `WPTPolicy`."""
+    """Return each parameter's name in a part of the authors' file, and in `WPTPolicy`."""
     module, layers = PARTS[part]
     for theirs, ours in layers.items():
         for kind in ("weight", "bias"):
@@ -109,19 +109,19 @@ def parameter_names(part: str) -> Iterator[tuple[str, str]]:
 
 
 def official_name(name: str) -> str:
-    """The authors' name of a parameter of `WPTPolicy`."""
+    """Return the authors' name of a parameter of `WPTPolicy`."""
     names = {ours: f"{part}.{theirs}" for part in PARTS for theirs, ours in parameter_names(part)}
     return names[name]
 
 
 def read_official(path: str | os.PathLike[str], stoch: int | None = None) -> Official:
-    """Read a model file of the paper's authors; nothing in it is run.
+    """Read a model file of the paper's authors without running any code in it.
 
     :param stoch: groups of z. The shapes hold only the product of groups and classes; by default
         there are 32 groups, as in every configuration of the authors
-    :raises FileNotFoundError: no such file
-    :raises ValueError: a file that is cut short, damaged, holds more than weights or is not of the
-        authors
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file is truncated, damaged, contains more than weights or is not a
+        model of the authors
     """
     path = Path(path)
     if not path.is_file():
@@ -137,7 +137,7 @@ def read_official(path: str | os.PathLike[str], stoch: int | None = None) -> Off
 def write_official(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:
     """Write a model file that the authors' scripts read.
 
-    :param tensors: by their names in `WPTPolicy.state_dict()`; others are left out
+    :param tensors: by their names in `WPTPolicy.state_dict()`; others are ignored
     """
     content: dict[str, Any] = {"wm": {}}
     for part in PARTS:
@@ -149,7 +149,7 @@ def write_official(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
 
 
 def _load(path: Path) -> Any:
-    """What `torch.load` reads with `weights_only=True`, every byte checked before."""
+    """Verify the checksums, then read with `torch.load(weights_only=True)`."""
     if not _is_archive(path):
         raise ValueError(
             f"{path} is not an archive of torch.save (a model file of wpt_agents is for WPT.load)"
@@ -172,7 +172,7 @@ def _load(path: Path) -> Any:
 
 
 def _is_archive(path: Path) -> bool:
-    """Whether this is an archive of `torch.save`, or may be a damaged one."""
+    """Return whether this is an archive of `torch.save`, possibly a damaged one."""
     with open(path, "rb") as file:
         if file.read(2) not in (b"PK", b""):
             return False
@@ -188,7 +188,7 @@ def _first_sentence(error: BaseException) -> str:
 
 
 def _parts(path: Path, content: Any) -> dict[str, Any]:
-    """The parts of a file by their names in `PARTS`."""
+    """Return the parts of a file by their names in `PARTS`."""
     if not isinstance(content, Mapping) or not isinstance(content.get("wm"), Mapping):
         raise ValueError(
             f"{path} is not a model of the paper's authors: it has no world model under 'wm'"
@@ -205,7 +205,7 @@ def _parts(path: Path, content: Any) -> dict[str, Any]:
 
 
 def _check_state(path: Path, part: str, names: Mapping[str, str], state: Any) -> None:
-    """Refuse a part that lacks a tensor, or has another one or one of another type."""
+    """Raise an error if a part lacks a tensor, has an unknown one, or one of another type."""
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} is not a model of the paper's authors: {part} is no state dict")
     for name in [*names, *state]:
@@ -221,7 +221,7 @@ def _check_state(path: Path, part: str, names: Mapping[str, str], state: Any) ->
 def _infer(
     path: Path, tensors: Mapping[str, Tensor], stoch: int | None
 ) -> tuple[dict[str, Any], int]:
-    """The fields of `Size`, and the padded action width."""
+    """Return the fields of `Size`, and the padded action width."""
     rssm, shapes = "world_model.rssm", {name: tuple(t.shape) for name, t in tensors.items()}
     try:
         hidden, deter = shapes[f"{rssm}.gru.from_deter.0.weight"]
@@ -240,7 +240,7 @@ def _infer(
 
 
 def _groups(path: Path, code: int, stoch: int | None) -> int:
-    """How many groups a z of `code` numbers has."""
+    """Return the number of groups in a z of `code` numbers."""
     if stoch is not None:
         if stoch < 1 or code % stoch:
             raise ValueError(f"{path} has a z of {code} numbers, no multiple of stoch={stoch}")

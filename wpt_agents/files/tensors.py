@@ -14,7 +14,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-TYPES = {  # in the order of the format's own list, by which tensors are sorted, last first
+TYPES = {  # in the format's own order, by which tensors are sorted, last first
     "BOOL": torch.bool,
     "U8": torch.uint8,
     "I8": torch.int8,
@@ -41,7 +41,7 @@ def write_tensors(file: IO[bytes], tensors: Mapping[str, Tensor]) -> None:
         header[name] = {"dtype": NAMES[tensor.dtype], "shape": list(tensor.shape)}
         header[name]["data_offsets"] = [start, end]
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    # as the reference implementation pads, so that tensors begin at a multiple of 8
+    # padded like the reference implementation, so that tensors begin at a multiple of 8
     text += b" " * (-len(text) % ALIGNMENT)
     file.write(len(text).to_bytes(8, "little"))
     file.write(text)
@@ -54,7 +54,7 @@ def read_tensors(file: IO[bytes], length: int) -> dict[str, Tensor]:
     """Read the tensors of a file that is open for reading, to its end.
 
     :param length: the length of the file in bytes
-    :raises ValueError: a file that is not in this format
+    :raises ValueError: if the file is not in this format
     """
     size = int.from_bytes(_filled(bytearray(8), file), "little")
     if size > length - 8:
@@ -72,13 +72,14 @@ def read_tensors(file: IO[bytes], length: int) -> dict[str, Tensor]:
         memory = torch.empty(stop - start, dtype=torch.uint8)
         _filled(memory.numpy().data, file)
         tensors[name], end = memory.view(dtype).reshape(shape), stop
-    if end != length - 8 - size or file.read(1):  # a zip checks its checksum at the very end
+    # reading to the end makes a zip archive verify the checksum
+    if end != length - 8 - size or file.read(1):
         raise ValueError("it is longer than its header says")
     return tensors
 
 
 def _filled(memory: Any, file: IO[bytes]) -> Any:
-    """Fill a buffer from a file, a piece at a time, and return it."""
+    """Fill a buffer from a file in chunks, and return it."""
     view = memoryview(memory)
     for start in range(0, len(view), PIECE):
         piece = file.read(min(PIECE, len(view) - start))

@@ -167,7 +167,7 @@ def as_actions(action: np.ndarray) -> np.ndarray:
     action = np.asarray(action)
     if action.ndim == 1 and action.dtype.kind in "iub":
         raise ValueError(
-            f"the action of a step is one whole number ({action.dtype}), a discrete action; "
+            f"the action of a step is one whole number ({action.dtype}), as for discrete actions; "
             "WPT needs continuous actions of shape (T, A)"
         )
     if action.ndim == 1:

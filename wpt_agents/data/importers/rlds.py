@@ -32,8 +32,8 @@ class RldsEpisodes(Episodes):
     """The episodes of one TFRecord file, or of all files below a folder, sorted by name.
 
     The language instruction becomes the task, unless `task` is set. If actions are a dictionary,
-    name its parts: `action_key=["action/world_vector", "action/rotation_delta"]`, or use all of them
-    with `action_key="action"`, in the order of `ORDER`.
+    name its parts: `action_key=["action/world_vector", "action/rotation_delta"]`, or use all of
+    them with `action_key="action"`, in the order of `ORDER`.
 
     :param folder: one version of a dataset, or a TFRecord file
     :param split: only files of this split, `train` for example

@@ -1,4 +1,4 @@
-"""The command line of the zoo: every command under its name, and how errors end.
+"""The command line of the zoo: all commands, and the handling of errors.
 
 Imports are inside the commands so that `--help` answers at once.
 """
@@ -74,9 +74,9 @@ start.__doc__ = HELP  # what `--help` shows
 
 
 def main() -> None:
-    """Run a command; every error ends in one sentence, and shows its traceback with `--debug`.
+    """Run a command. Errors are printed as one sentence, with a traceback if `--debug` is set.
 
-    The exit code is 2 for mistakes that the user can mend, 1 for ours, and 130 for an interruption.
+    The exit code is 2 for errors that the user can fix, 1 for bugs, and 130 for an interruption.
     """
     words = [word for word in sys.argv[1:] if word != DEBUG]
     try:
@@ -87,7 +87,7 @@ def main() -> None:
         if len(words) < len(sys.argv) - 1:
             traceback.print_exc()
         message, code = explain(error)
-        if message:  # typer has none where it has shown the help of a group such as `data`
+        if message:  # empty if typer has printed the help of a group such as `data`
             typer.secho(f"Error: {message}", fg="red", err=True)
     if code == INTERRUPTED:
         typer.echo("Interrupted. The same command continues from the finished stages.", err=True)
@@ -98,7 +98,7 @@ def explain(error: Exception) -> tuple[str, int]:
     """Return the sentence that describes an error, and the exit code."""
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("wpt_"):
         return f'{error.name} is not installed: pip install "wpt-agents[all]"', 2
-    if hasattr(error, "format_message"):  # typer's, of a wrong option or value
+    if hasattr(error, "format_message"):  # typer's error for a wrong option or value
         context = getattr(error, "ctx", None)
         command = context.command_path if context else PROGRAM
         sentence = error.format_message().replace("Value error, ", "").rstrip(".")

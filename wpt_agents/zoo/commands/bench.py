@@ -1,4 +1,4 @@
-"""The command `bench`: which case is measured, and how its rows are shown.
+"""The command `bench`: choose a case, run it, and print its rows.
 
 Each case is a module of `wpt_agents.zoo.bench` with a function `rows(quick)`, imported when needed.
 """
@@ -36,7 +36,7 @@ CaseOption = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")]
 Quick = Annotated[
-    bool, typer.Option(help="Only check that it runs, in seconds; the numbers mean little.")
+    bool, typer.Option(help="Only check in seconds that it runs; the numbers are not meaningful.")
 ]
 Threads = Annotated[
     int,
@@ -49,7 +49,7 @@ Compiled = Annotated[
     bool,
     typer.Option(
         "--compile",
-        help="For model and gpu: compile the recurrent steps with torch.compile, in minutes.",
+        help="For model and gpu: use torch.compile for the recurrent steps, which takes minutes.",
     ),
 ]
 PeerOption = Annotated[
@@ -68,13 +68,13 @@ Behaviour = Annotated[
 ]
 Steps = Annotated[
     int | None,
-    typer.Option(min=1, help="For exploration: the number of steps that explore-state learns for."),
+    typer.Option(min=1, help="For exploration: the number of training steps of explore-state."),
 ]
 Probe = Annotated[
     bool,
     typer.Option(
         "--probe",
-        help="For prediction: show instead how well linear probes read the true state from the "
+        help="For prediction: print instead how well linear probes predict the true state from the "
         "latents.",
     ),
 ]
@@ -137,7 +137,7 @@ def bench(
 
 
 def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:
-    """Yield the rows of a case, each with the memory that it took; pass the options it takes."""
+    """Yield the rows of a case with their memory use; pass only the options that it accepts."""
     from wpt_agents.zoo.bench.timing import forget_peak, peak_rss_mb
 
     taken = inspect.signature(module.rows).parameters

@@ -25,7 +25,7 @@ Store = Annotated[Path, typer.Argument(help="The folder of a dataset.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the zoo's."""
+    """Add the commands to the zoo's command line."""
     app.command("collect", cls=Spaced)(collect_data)
     app.command("import")(import_data)
     data.command("show")(show_data)
@@ -49,7 +49,7 @@ Episodes = Annotated[
 Behaviour = Annotated[
     str,
     typer.Option(
-        help="What chooses the actions: noise, random, scripted (Meta-World), policy (a saved "
+        help="The source of the actions: noise, random, scripted (Meta-World), policy (a saved "
         "one), explore-state, icm or plan2explore (curious agents). By default scripted in "
         "metaworld and noise elsewhere."
     ),
@@ -153,12 +153,12 @@ def show_data(
 def validate_data(
     folder: Store,
     set_aside: Annotated[
-        bool, typer.Option("--set-aside", help="Exclude damaged trajectories from now on.")
+        bool, typer.Option("--set-aside", help="Exclude the damaged trajectories from further use.")
     ] = False,
 ) -> None:
     """Read every byte of a dataset and name the damaged trajectories.
 
-    The exit code is 1 if there are any and they are not set aside.
+    The exit code is 1 if there are any and they are not excluded.
 
     Example: `python -m wpt_agents.zoo data validate data/two`
     """

@@ -136,7 +136,7 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def print_summary(dataset: "TrajectoryDataset") -> None:
-    """Print what the dataset contains for each robot, and where it is."""
+    """Print the dataset's content for each robot, and its path."""
     from wpt_agents.zoo.pictures.datasets import data_table
     from wpt_agents.zoo.terminal import console
 

@@ -53,7 +53,7 @@ def _widths(model: Any) -> str:
 
 
 def _arguments(model: Any) -> str:
-    """What the authors' configuration must say to make networks of these widths."""
+    """Return the settings of the authors' configuration for networks of these widths."""
     size = model.policy.size
     rssm = {name: getattr(size, name) for name in ("deter", "hidden", "stoch", "classes", "blocks")}
     words = [f"agent.rssm.{name}={value}" for name, value in rssm.items()]

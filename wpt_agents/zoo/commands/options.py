@@ -1,4 +1,4 @@
-"""What several commands share: options, and options that take several values."""
+"""Options that several commands share, and support for options with several values."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -9,13 +9,13 @@ from typer.core import TyperCommand
 
 
 class Spaced(TyperCommand):
-    """Lets an option take several values at once: `--tasks a b` for `--tasks a --tasks b`."""
+    """A command whose options take several values: `--tasks a b` for `--tasks a --tasks b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Repeat the option's name before each further value."""
         several = {o for p in self.params if p.multiple for o in p.opts}
         words: list[str] = []
-        option = None  # that takes several values, if the last one does
+        option = None  # the current option, if it takes several values
         has_value = False
         for arg in args:
             if arg.startswith("-"):
@@ -44,7 +44,7 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Changes of the preset: keywords of WPT (`gamma=0.98`), or `section.key=value` "
+        help="Changes to the preset: keywords of WPT (`gamma=0.98`), or `section.key=value` "
         "(`pretrain.steps=500`, `env.rendering=near`).",
     ),
 ]
@@ -67,7 +67,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = Table(title=title)
     for name in columns:
-        widest = max(map(len, name.split()))  # words are broken only where there is no room
+        widest = max(map(len, name.split()))  # words are broken only if there is no room
         table.add_column(name, overflow="fold", min_width=min(widest, 12))
     for row in rows:
         table.add_row(*(_cell(row.get(key, "")) for key in columns))

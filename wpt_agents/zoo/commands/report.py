@@ -20,7 +20,7 @@ def report(
     record: Annotated[
         Path | None,
         typer.Option(
-            help="A CSV file to which a line for every policy and run is added; other lines stay."
+            help="A CSV file to update with a line for every policy and run; other lines are kept."
         ),
     ] = None,
     media: Annotated[

@@ -1,4 +1,4 @@
-"""The commands that show what retrieval finds: retrieve show, share."""
+"""The commands that show the results of retrieval: retrieve show, share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -73,7 +73,7 @@ def share_retrieval(
     ] = Rendering.near,
     number: Annotated[int, typer.Option(min=1, help="The number of retrieved trajectories.")] = 40,
     images: Annotated[
-        list[int], typer.Option(min=1, help="How many first images of the task are compared.")
+        list[int], typer.Option(min=1, help="The number of first images of the task to compare.")
     ] = [1, 5, 10, 20, 40],  # noqa: B006
     seed: Annotated[int, typer.Option(help="The seed of the first episode.")] = 0,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The commands that plan and do runs: list, pretrain, run."""
+"""The commands that plan and execute runs: list, pretrain, run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -52,7 +52,7 @@ FromNothing = Annotated[
         "library (as `--set pretrain.model=`).",
     ),
 ]
-DryRun = Annotated[bool, typer.Option(help="Only show what would be run.")]
+DryRun = Annotated[bool, typer.Option(help="Only show what would run.")]
 Watch = Annotated[
     bool, typer.Option(help="Only show the progress of these runs, started in another terminal.")
 ]
@@ -78,14 +78,13 @@ Hours = Annotated[
     ),
 ]
 Retries = Annotated[
-    int, typer.Option(min=0, help="How often a run is continued after its worker was killed.")
+    int,
+    typer.Option(min=0, help="The number of times a run is resumed after its worker was killed."),
 ]
 Address = Annotated[
     str, typer.Option(help="The address of a Ray cluster; by default one is started here.")
 ]
-Partition = Annotated[
-    str, typer.Option(help="The partition of Slurm; `local` works without Slurm.")
-]
+Partition = Annotated[str, typer.Option(help="The Slurm partition; `local` works without Slurm.")]
 
 
 def list_tasks(

@@ -331,6 +331,15 @@ def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_pat
     assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
 
 
+@pytest.mark.parametrize("method", ["wpt", "wpt+"])
+@pytest.mark.parametrize("key", ["kickstart", "wpt.kickstart"])
+def test_a_setting_overrules_the_additions_of_the_preset(key, method, tmp_path):
+    settings = ["plus.kickstart=7", f"{key}=5"]
+    [one] = plan("metaworld", ["drawer-close"], "mid", tmp_path, method, settings)
+    assert one.keywords["kickstart"] == 5
+    assert one.keywords.get("actor_delay") == (300 if method == "wpt+" else None)
+
+
 def test_an_empty_value_trains_the_shipped_model_again():
     shipped = load_preset("metaworld", "mid").pretrain
     assert shipped.model == "metaworld-mid"

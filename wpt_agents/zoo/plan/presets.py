@@ -251,7 +251,7 @@ def load_preset(
 ) -> Preset:
     """The preset `name` of `suite`, changed by `changes` and then by `settings`.
 
-    :param settings: each "section.key=value", or "key=value" for a keyword of WPT
+    :param settings: each "section.key=value", or "key=value" for a keyword of WPT, also in `plus`
     :param changes: sections in the form of the YAML files
     """
     content = _read_suite(suite)
@@ -259,9 +259,12 @@ def load_preset(
         raise unknown_name(f"{suite} preset", name, content.presets)
     values: dict[str, dict[str, Any]] = {}
     parts = content.default, content.presets[name] or {}, *changes, *map(_setting, settings)
-    for part in parts:
+    for i, part in enumerate(parts):
         for title, section in part.items():
             values[title] = {**values.get(title, {}), **(section or {})}
+            if title == "wpt" and i >= len(parts) - len(settings):  # what the user sets comes first
+                for key in section:
+                    values.get("plus", {}).pop(key, None)
     return Preset.of(values)
 
 

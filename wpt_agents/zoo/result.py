@@ -52,6 +52,11 @@ class Change:
         key, _, value = text.partition("=")
         return cls(key.strip(), value)
 
+    @property
+    def short(self) -> Self:
+        """The same change with the shortest name of its key: WPT's keywords need no section."""
+        return type(self)(self.key.removeprefix("wpt."), self.value.strip())
+
     def __str__(self) -> str:
         return f"{self.key}={self.value}"
 

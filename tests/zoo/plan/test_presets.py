@@ -340,6 +340,12 @@ def test_a_setting_overrules_the_additions_of_the_preset(key, method, tmp_path):
     assert one.keywords.get("actor_delay") == (300 if method == "wpt+" else None)
 
 
+@pytest.mark.parametrize("setting", ["gamma=0.9", "wpt.gamma=0.9", " wpt.gamma = 0.9 "])
+def test_one_setting_has_one_label_however_it_is_written(setting, tmp_path):
+    [one] = plan("dmc", ["walker-run"], "debug", tmp_path, settings=["gamma=0.98", setting])
+    assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
+
+
 def test_an_empty_value_trains_the_shipped_model_again():
     shipped = load_preset("metaworld", "mid").pretrain
     assert shipped.model == "metaworld-mid"

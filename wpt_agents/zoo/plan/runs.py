@@ -200,7 +200,7 @@ def make_plan(
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
     check_preset(resolved)
-    changes = tuple({c.key: c for c in map(Change.parse, settings)}.values())
+    changes = tuple({c.key: c for c in (Change.parse(s).short for s in settings)}.values())
     names = list(dict.fromkeys(methods))
     for name in names:
         check_changes(name, changes)
@@ -250,7 +250,7 @@ def check_changes(name: str, changes: Sequence[Change]) -> None:
     """Refuse a setting that the method overrules or its agent does not take."""
     method = find_method(name)
     for change in changes:
-        keyword = change.key.removeprefix("wpt.")
+        keyword = change.key
         if keyword in method.keywords:
             raise ValueError(
                 f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "

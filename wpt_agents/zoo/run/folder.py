@@ -14,13 +14,20 @@ from wpt_agents.zoo.plan.runs import Run
 
 
 def clear(folder: Path) -> None:
-    """Delete what a run has left but its lock; first what says that it is finished."""
-    (folder / "result.json").unlink(missing_ok=True)
+    """Delete what a run or a sequence has left but its lock.
+
+    What says that something is finished is deleted first, and `config.yaml`, without which the
+    folder would be refused, last: after a kill in between, the same command can begin again.
+    """
+    config = folder / "config.yaml"
+    for path in (folder / "result.json", folder / "sequence.json", *folder.glob("*/scores.json")):
+        path.unlink(missing_ok=True)
     for path in folder.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
-        elif path.name != "lock":
+        elif path.name not in ("lock", config.name):
             path.unlink()
+    config.unlink(missing_ok=True)
 
 
 def check_folder(job: Run, force: bool) -> None:

@@ -3,7 +3,7 @@
 import pytest
 from dot_runs import job
 
-from wpt_agents.zoo.run import folder
+from wpt_agents.zoo.run import folder, runner
 from wpt_agents.zoo.run.folder import check_folder, clear
 
 
@@ -29,3 +29,10 @@ def test_a_clearing_that_is_killed_at_any_point_can_be_done_again(tmp_path, monk
     check_folder(one, force=True)
     clear(one.folder)
     assert [path.name for path in one.folder.iterdir()] == ["lock"]
+
+
+def test_a_run_that_another_process_finishes_meanwhile_is_not_begun_again(tmp_path, monkeypatch):
+    results = iter([None, "finished while this process waited for the lock"])
+    monkeypatch.setattr(runner, "read_result", lambda folder: next(results))
+    monkeypatch.setattr(runner, "do_stages", lambda job: "begun again")
+    assert runner.run(job(tmp_path, "scratch")).startswith("finished while")

@@ -65,7 +65,8 @@ def run(job: Run, force: bool = False) -> Result:
     with locked(job.folder / "lock"):
         if force:
             clear(job.folder)
-        return _begin(job)
+        # another process may have finished it while this one waited for the lock
+        return read_result(job.folder) or _begin(job)
 
 
 def _begin(job: Run) -> Result:

@@ -3,7 +3,7 @@
     python examples/custom_environment.py --steps 3000
 
 The environment shows a dot that two actions push towards a target. `WPT` needs images as
-observations and a `Box` with finite bounds as actions; everything else is Gymnasium's.
+observations and a `Box` with finite bounds as actions; all else is standard Gymnasium.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python examples/episodes_that_end.py --env InvertedPendulum-v5 --seeds 2
 
-The reward of such tasks is nearly the same at every step, and what counts is to stay in the
-episode. A continue head predicts from the world model's state whether the episode goes on, so that
+The reward of such tasks is nearly constant, so the return depends on the length of the episode. A
+continue head predicts from the world model's state whether the episode goes on, so that
 imagined returns end where the episode would. `WPT` adds one automatically once an episode has
 terminated; this script switches it off for comparison.
 """
@@ -39,9 +39,9 @@ def make_env(env_id: str) -> gym.Env:
 
 
 def main(env_id: str, steps: int, seeds: int, **changes: Any) -> dict[str, list[float]]:
-    """Learn with either setting and every seed.
+    """Learn with both settings and every seed.
 
-    :return: the mean return of 20 episodes by seed, for either setting
+    :return: the mean return of 20 episodes by seed, for both settings
     """
     env = make_env(env_id)
     settings = SETTINGS | {"max_action_dim": env.action_space.shape[0]} | changes

@@ -3,7 +3,7 @@
     python examples/fine_tune.py runs/pretrained/model.zip data/arm --steps 10000
 
 The dataset is the one that the model was pre-trained on. `learn` retrieves trajectories from it
-that start like the task, and replays them. A clone of them, the prior actor, guides early episodes.
+that start like the task, and replays them. The prior actor imitates them and guides early episodes.
 """
 
 import argparse
@@ -45,8 +45,8 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("model", type=Path, help="a file that pretrain or save has written")
-    parser.add_argument("dataset", type=Path, help="the folder that it was pre-trained on")
+    parser.add_argument("model", type=Path, help="a model file written by pretrain or save")
+    parser.add_argument("dataset", type=Path, help="the dataset that it was pre-trained on")
     parser.add_argument("--task", default="wpt/metaworld-drawer-close-v0", help="an id of wpt_envs")
     parser.add_argument("--steps", type=int, default=10_000, help="calls of env.step")
     parser.add_argument(

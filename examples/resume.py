@@ -1,9 +1,9 @@
-"""Learn in a way that survives being killed: start the script again, and it continues.
+"""Save checkpoints while learning: after an interruption, start the script again to continue.
 
     python examples/resume.py --steps 3000
 
 Model and replay buffer are saved together after every block of steps. Files are written beside
-their destination and then renamed, so a kill in the middle of saving leaves the previous ones.
+their destination and then renamed, so the previous ones survive if saving is interrupted.
 """
 
 import argparse
@@ -21,7 +21,7 @@ def main(steps: int, folder: Path, block: int = 500, **changes: Any) -> WPT:
     settings = SETTINGS | changes
     if model_file.exists():
         model = WPT.load(model_file, env=PushDot())
-        # the replay buffer belongs to the number of steps in the model's file
+        # each replay buffer is named after the number of steps of its model
         model.load_replay_buffer(folder / f"replay-{model.num_timesteps}.zip")
         print(f"continuing after {model.num_timesteps} steps")
     else:
@@ -31,7 +31,7 @@ def main(steps: int, folder: Path, block: int = 500, **changes: Any) -> WPT:
         before = folder / f"replay-{model.num_timesteps}.zip"
         model.learn(min(block, steps - model.num_timesteps), reset_num_timesteps=False)
         model.save_replay_buffer(folder / f"replay-{model.num_timesteps}.zip")
-        model.save(model_file)  # last: from now on, the new replay buffer is the one to load
+        model.save(model_file)  # saved last: from now on, the new replay buffer is loaded
         before.unlink(missing_ok=True)
         print(f"saved after {model.num_timesteps} steps, {model.updates} updates")
     return model

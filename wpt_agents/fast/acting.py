@@ -1,8 +1,8 @@
-"""`acting_step` in few operators, for a CPU.
+"""`acting_step` with few operators, for a CPU.
 
-At batch 1 there is little arithmetic. The time goes into calling operators, into reading weights
-across their order in memory, and into copying them into another order. Here these copies are kept,
-and are made again only when weights have changed: between two episodes, not between two steps.
+At batch size 1 there is little arithmetic. Most of the time is spent on calling operators, on
+reading weights against their order in memory, and on copying them into another order. These copies
+are cached here, and renewed only when weights have changed: between episodes, not between steps.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ from wpt_agents.model.rssm import RSSM, Latent
 
 
 class FastStep:
-    """`acting_step` with the weights that a policy's networks have now; see `is_current`."""
+    """`acting_step` with the current weights of a policy's networks; see `is_current`."""
 
     def __init__(self, policy: WPTPolicy) -> None:
         self.networks = networks_of(policy)
@@ -35,20 +35,20 @@ class FastStep:
             for name in module._parameters
         ]
         self.marks = self._marks(policy)
-        # keep the memory of the present weights, so that no other weight gets the same address
+        # keep the current weights alive, so that no other weight gets the same address
         self.memory = [module[name].detach() for module, name in self.places]
 
     def is_current(self, policy: WPTPolicy) -> bool:
-        """Return whether no weight has changed since this was made."""
+        """Return whether the weights are unchanged since this was created."""
         same = all(a is b for a, b in zip(self.networks, networks_of(policy), strict=True))
         return same and self.marks == self._marks(policy)
 
     def _marks(self, policy: WPTPolicy) -> tuple[int, list[tuple[int, int]]]:
         """Return the policy's count of updates, and each weight's address and version.
 
-        The count is for fused optimisers, which do not raise the versions that autograd keeps.
-        Addresses and versions are for changes that nobody counts: by `AveragedModel`, by
-        `polyak_update`, by `vector_to_parameters`, or by hand.
+        The count detects updates by fused optimisers, which do not increase autograd's versions.
+        Addresses and versions detect all other changes: by `AveragedModel`, `polyak_update`,
+        `vector_to_parameters`, or by hand.
         """
         weights = (module[name] for module, name in self.places)
         return policy.updates, [(weight.data_ptr(), weight._version) for weight in weights]
@@ -62,7 +62,7 @@ class FastStep:
         generator: Noise,
         sample: bool,
     ) -> tuple[Latent, Tensor]:
-        """Return the new state, and the actor's outputs (N, 2 A) there."""
+        """Return the new state and the actor's outputs (N, 2 A)."""
         if is_first.any():
             keep = (~is_first).float()[:, None]
             state = Latent(state.deter * keep, state.stoch * keep[..., None])
@@ -71,8 +71,8 @@ class FastStep:
         return state, self.outputs(state)
 
 
-# A policy's fast step, as long as the policy exists. It is not an attribute of the policy, so that
-# copying, pickling and saving a policy need not know of it.
+# The fast step of each policy, for as long as the policy exists. It is not an attribute of the
+# policy, so that copying, pickling and saving a policy are unaffected.
 _fast_steps: WeakKeyDictionary[WPTPolicy, FastStep] = WeakKeyDictionary()
 
 
@@ -82,7 +82,7 @@ def networks_of(policy: WPTPolicy) -> tuple[Encoder, RSSM, Actor]:
 
 
 def fast_step(policy: WPTPolicy) -> FastStep:
-    """Return the step for the policy's present weights, made again if they have changed."""
+    """Return the step for the policy's current weights; renew it if they have changed."""
     step = _fast_steps.get(policy)
     if step is None or not step.is_current(policy):
         step = FastStep(policy)
@@ -91,10 +91,10 @@ def fast_step(policy: WPTPolicy) -> FastStep:
 
 
 def networks_are_known(policy: WPTPolicy, *_: Any, **__: Any) -> bool:
-    """Return whether these classes act, not subclasses, on a CPU, with weights that have versions.
+    """Return whether the networks are exactly these classes, on a CPU, with versioned weights.
 
-    `torch.compile` and users replace networks by others, of which nothing is known here. Weights
-    that were made in `torch.inference_mode` have no versions.
+    `torch.compile` and users may replace networks with unknown ones. Weights that were created in
+    `torch.inference_mode` have no versions.
     """
     encoder, rssm, actor = networks_of(policy)
     # `type` and not `isinstance`: a subclass may compute something else
@@ -112,5 +112,5 @@ def acting_step_with_copies(
     generator: Noise = None,
     sample: bool = True,
 ) -> tuple[Latent, Tensor]:
-    """`acting_step` with copies of the weights in the order in which they are read."""
+    """`acting_step` with cached copies of the weights in reading order."""
     return fast_step(policy)(image, state, action, is_first, generator, sample)

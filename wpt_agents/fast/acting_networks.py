@@ -1,4 +1,4 @@
-"""The networks that act, computed in few operators from weights in the order of their use."""
+"""The networks for acting, with few operators and weights stored in reading order."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -14,8 +14,8 @@ from wpt_agents.model.gru import split_gates
 from wpt_agents.model.images import Encoder
 from wpt_agents.model.rssm import RSSM, Latent
 
-PATCHES = 256  # of several images; with more, a convolution is faster than a product (measured)
-WIDE_STOCH = 1024  # numbers in z from which on picking rows is faster than a product (measured)
+PATCHES = 256  # of several images; above it a convolution is faster than a product (measured)
+WIDE_STOCH = 1024  # size of z above which selecting rows is faster than a product (measured)
 
 
 class Layer(NamedTuple):
@@ -43,10 +43,10 @@ def linear_norm(layers: Iterable[Any]) -> Layer:
 
 
 class OneHotProduct:
-    """z W' + x for a z (N, S, C) whose groups are one-hot, or zero where an episode begins.
+    """z W' + x for z (N, S, C), whose groups are one-hot, or zero at the start of an episode.
 
-    If z is wide, the columns of W at its ones are picked: that reads only a C-th of W, and reading
-    takes the time.
+    If z is large, only the columns of W at the ones of z are selected. This reads 1/C of W, and
+    reading is the bottleneck.
 
     :param weight: W, (outputs, S C)
     """
@@ -61,7 +61,7 @@ class OneHotProduct:
         """(outputs,) or (N, outputs), and z -> (N, outputs)."""
         if self.rows is None:
             return torch.addmm(x, stoch.flatten(1), self.matrix)
-        value, index = stoch.max(-1)  # 0 where an episode begins
+        value, index = stoch.max(-1)  # 0 at the start of an episode
         index += self.first
         return F.embedding_bag(index, self.rows, mode="sum", per_sample_weights=value).add_(x)
 
@@ -69,7 +69,8 @@ class OneHotProduct:
 class FastConv:
     """A convolution of stride 2, its norm and SiLU, channels last: (N, H, W, C) -> (N, H', W', C').
 
-    Few patches are one product of matrices, which spares oneDNN's reordering of the weights.
+    A small number of patches is computed as one matrix product, which avoids the reordering of
+    weights in oneDNN.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, norm: nn.LayerNorm) -> None:
@@ -87,7 +88,7 @@ class FastConv:
         if n > 1 and n * rows * columns > PATCHES:
             x = F.conv2d(x.permute(0, 3, 1, 2), self.weight, self.bias, 2).permute(0, 2, 3, 1)
             return norm_silu(x, self.norm)
-        # the pixels of a patch's line are adjacent in memory: 4 lines of 4 pixels
+        # a patch is 4 lines of 4 pixels, each line contiguous in memory
         patches = x.as_strided(
             (n, rows, columns, 4, 4 * channels),
             (height * line, 2 * line, 2 * channels, line, 1),
@@ -97,7 +98,7 @@ class FastConv:
 
 
 class FastEncoder:
-    """e(o), with the channels of each of its 2 x 2 pixels side by side."""
+    """e(o), with the channels of its 2 x 2 pixels concatenated pixel by pixel."""
 
     def __init__(self, encoder: Encoder) -> None:
         layers = list[Any](encoder.layers)
@@ -105,7 +106,7 @@ class FastEncoder:
         norms = layers[1::3]
         weights = [conv.weight for conv in convs]
         biases = [conv.bias for conv in convs]
-        # `to_unit`, o / 255 - 0.5, becomes part of the first layer: W (o / 255 - 0.5) + b
+        # `to_unit`, o / 255 - 0.5, is folded into the first layer: W (o / 255 - 0.5) + b
         biases[0] = biases[0] - 0.5 * weights[0].sum((1, 2, 3))
         weights[0] = weights[0] / 255
         self.layers = [FastConv(*layer) for layer in zip(weights, biases, norms, strict=True)]
@@ -120,7 +121,7 @@ class FastEncoder:
 
 
 class FastFilter:
-    """`filter_step`, with one matrix for each layer that sees several inputs."""
+    """`filter_step`, with one matrix for each layer that has several inputs."""
 
     def __init__(self, rssm: RSSM) -> None:
         gru = rssm.gru
@@ -136,13 +137,13 @@ class FastFilter:
         self.stoch_bias = from_stoch.bias
         width = size.deter // gru.blocks
         self.private = gru.hidden.weight[:, :width]
-        # (inputs, D), of which each output's weights are adjacent in memory
+        # (inputs, D), with each output's weights contiguous in memory
         self.shared = gru.hidden.weight[:, width:].transpose(1, 2).flatten(0, 1).t()
         self.hidden_bias = gru.hidden.bias
         self.norm = gru.norm
         self.gates = gru.gates.weight
         gates_bias = gru.gates.bias.detach().clone()
-        # The 1 that `BlockGRU` subtracts becomes part of the bias.
+        # The 1 that `BlockGRU` subtracts is folded into the bias.
         split_gates(gates_bias[None], gru.blocks, gru.layout)[2].sub_(1)  # of the update gate
         self.gates_bias = gates_bias.view(gru.blocks, 1, -1)
         from_deter = rssm.post_in.weight[:, : size.deter]
@@ -154,15 +155,15 @@ class FastFilter:
     def __call__(
         self, state: Latent, action: Tensor, embed: Tensor, generator: Noise, sample: bool
     ) -> Latent:
-        """Make one step from a state (N, ...) that is zero where an episode begins.
+        """Filter one step from a state (N, ...), which is zero at the start of an episode.
 
-        :param embed: of `FastEncoder`
+        :param embed: the output of `FastEncoder`
         """
         deter = self._next_deter(state, action)
         hidden = self.post(torch.cat([deter, embed], 1))
         logits = torch.addmm(self.post_out.bias, hidden, self.post_out.weight.t())
         logits = logits.view(state.stoch.shape)
-        if sample:  # as `unimix_logits` mixes and `sample_one_hot` draws
+        if sample:  # same as `unimix_logits` and `sample_one_hot`
             probs = logits.softmax(-1).mul_(1 - self.unimix).add_(self.unimix / self.size.classes)
             logits = probs.div_(exponential(probs, generator))
         index = logits.argmax(-1, keepdim=True)

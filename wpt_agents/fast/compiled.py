@@ -1,8 +1,8 @@
-"""Filtering steps and dreams by `torch.compile`, for a GPU.
+"""Filtering steps and imagination with `torch.compile`, for a GPU.
 
-There, launching an operator takes as long as computing it, and compiled code launches fewer. What
-is compiled are the definitions. Compiled code cannot use generators, so random numbers are
-drawn before, in the same order: the same seed gives the same results.
+On a GPU, launching an operator takes as long as computing it, and compiled code launches fewer.
+The functions of `wpt_agents.model` are compiled unchanged. Compiled code cannot use generators, so
+random numbers are drawn in advance in the same order: the same seed gives the same results.
 """
 
 from collections.abc import Callable
@@ -18,20 +18,20 @@ from wpt_agents.model.rssm import RSSM, Latent, filter_step
 
 Step = Callable[..., tuple[Latent, Tensor]]
 
-# The networks that `compile_loops` was called for. A copy of a network is not among them.
+# The networks that `compile_loops` was called for, without copies of them.
 _steps: WeakKeyDictionary[RSSM, Step] = WeakKeyDictionary()
 _dreams: WeakKeyDictionary[WPTPolicy, Callable[..., Dream]] = WeakKeyDictionary()
 
 
 def compile_loops(policy: WPTPolicy, backend: str | Callable[..., Any] = "inductor") -> None:
-    """Compile a policy's filtering steps and dreams, from their first call on.
+    """Compile a policy's filtering steps and imagination at their first call.
 
-    On a CPU, sequences are still filtered by scan.py, and only the dreams are compiled.
+    On a CPU, sequences are still filtered by scan.py, and only imagination is compiled.
 
-    :param backend: of `torch.compile`
+    :param backend: the backend of `torch.compile`
     """
-    # the functions must not refer to their keys, or these would never be forgotten
-    # fullgraph: a break in the graph would bring back the launches that compiling saves
+    # the functions must not reference their keys, or these would never be garbage-collected
+    # fullgraph: a graph break would bring back the launches that compilation avoids
     _steps[policy.world_model.rssm] = torch.compile(
         _step, backend=backend, dynamic=False, fullgraph=True
     )

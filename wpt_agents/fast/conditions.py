@@ -1,4 +1,4 @@
-"""Conditions that several faster twins share."""
+"""Conditions that several fast implementations share."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def always(*args: Any, **kwargs: Any) -> bool:
-    """Return True: this twin is faster on every device and for every shape."""
+    """Return True: this implementation is faster on every device and for every shape."""
     return True
 
 
@@ -17,5 +17,5 @@ def on_cpu(x: Tensor) -> bool:
 
 
 def in_bfloat16(x: Tensor) -> bool:
-    """Return whether a product or convolution of x will be computed in bfloat16, on a CPU."""
+    """Return whether products and convolutions of x are computed in bfloat16 on a CPU."""
     return on_cpu(x) and torch.is_autocast_enabled("cpu")

@@ -1,6 +1,6 @@
-"""Strided convolutions as what a CPU computes faster, and the reconstruction error that uses them.
+"""Faster strided convolutions for a CPU, and the reconstruction error that uses them.
 
-An output pixel (2i + p, 2j + q) of a transposed convolution of stride 2 sees only the kernel's
+An output pixel (2i + p, 2j + q) of a transposed convolution of stride 2 depends only on the kernel
 entries of parity (p, q). So the four parities are four ordinary convolutions of the input, computed
 here as one 3x3 convolution with four times the channels, followed by a shuffle of the pixels.
 """
@@ -31,7 +31,7 @@ def is_one_image_without_gradient(x: Tensor, *_: Any, **__: Any) -> bool:
 def down_conv_by_patches(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """`down_conv` of one image as a product of its patches.
 
-    It spares oneDNN's reordering of the weights, which a single image does not repay.
+    It avoids the reordering of weights in oneDNN, which is not worthwhile for a single image.
     """
     kernel = weight.shape[-1]
     patches = x[0].unfold(1, kernel, 2).unfold(2, kernel, 2).permute(1, 2, 0, 3, 4)
@@ -49,19 +49,19 @@ def is_single_pixel(x: Tensor, *_: Any, **__: Any) -> bool:
 
 @up_conv.faster(when=is_single_pixel)
 def up_conv_of_a_pixel(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """`up_conv` of a single pixel as the product of matrices that it is."""
+    """`up_conv` of a single pixel as a matrix product."""
     matrix = weight.permute(0, 2, 3, 1)  # (inputs, K, K, outputs)
     out = linear(x.flatten(1), matrix.flatten(1).t()).view(len(x), *matrix.shape[1:]) + bias
     return out.permute(0, 3, 1, 2)
 
 
 def has_phases(x: Tensor, weight: Tensor, bias: Tensor) -> bool:
-    """Return whether `phases` can be used: on a CPU, for the kernels that fit into 6 x 6."""
+    """Return whether `phases` can be used: on a CPU, with kernels of at most 6 x 6."""
     return on_cpu(x) and weight.shape[-1] in (5, 6)
 
 
 def has_phases_in_bfloat16(x: Tensor, weight: Tensor, bias: Tensor) -> bool:
-    """Return whether `phases` can be used and will be computed in bfloat16."""
+    """Return whether `phases` can be used and is computed in bfloat16."""
     return has_phases(x, weight, bias) and in_bfloat16(x)
 
 
@@ -75,7 +75,7 @@ def up_conv_by_phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 @up_conv.faster(when=has_phases)
 def up_conv_forward_by_phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """`up_conv` as one 3x3 convolution forward and as itself backward: each the faster way."""
+    """`up_conv` as one 3x3 convolution forward and unchanged backward, which is fastest."""
     image: Tensor = _ForwardByPhases.apply(x, weight, bias)  # type: ignore[no-untyped-call]
     return image
 
@@ -99,19 +99,19 @@ class _ForwardByPhases(torch.autograd.Function):
 
 
 def phases(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """The four parities of an `up_conv` side by side; `interleaved` makes an image of them.
+    """Return the four parities of an `up_conv` as channels; see `interleaved`.
 
     :return: (N, H + 2, W + 2, 4 outputs) of (N, inputs, H, W), (inputs, outputs, K, K), (outputs,)
     """
     inputs, outputs, kernel, _ = weight.shape
-    # A kernel of 5 becomes one of 6, whose parities all have 3 x 3 entries.
+    # A kernel of size 5 is padded to 6, so that all parities have 3 x 3 entries.
     weight = F.pad(weight, (0, 6 - kernel, 0, 6 - kernel))
     weight = weight.view(inputs, outputs, 3, 2, 3, 2).permute(3, 5, 1, 0, 2, 4).flip(-1, -2)
     weight = weight.reshape(4 * outputs, inputs, 3, 3)
     bias = bias.repeat(4)
     if not in_bfloat16(x):
         return F.conv2d(x, weight, bias, padding=2).permute(0, 2, 3, 1)
-    # oneDNN's gradient of a bias in bfloat16 is slow; that of an addition is a plain sum
+    # oneDNN's bias gradient is slow in bfloat16; the gradient of an addition is a plain sum
     out = F.conv2d(x, weight, padding=2).permute(0, 2, 3, 1)
     return out.add_(bias.to(out.dtype))
 
@@ -150,7 +150,7 @@ def reconstruction_error_by_parity(
 
     def error(image: Tensor, code: Tensor, *moving: Tensor) -> Tensor:
         weight = None
-        if moving:  # each pixel's three colours are side by side
+        if moving:  # the three colours of each pixel are adjacent
             marks = by_parity(moving[0][..., None]).repeat_interleave(image.shape[-1], -1)
             weight = pixel_weights(marks, pixel_weight)
         return squared_error(to_unit(by_parity(image)), decoded_parities(decoder, code), weight)
@@ -161,9 +161,9 @@ def reconstruction_error_by_parity(
 
 
 def decoded_parities(decoder: Decoder, code: Tensor) -> Tensor:
-    """(N, C, 5, 5) -> (N, 32, 32, 12), which `interleaved` makes the decoder's images.
+    """(N, C, 5, 5) -> (N, 32, 32, 12), which `interleaved` converts to the decoder's images.
 
-    On a CPU the last layer is computed in float32: with few channels bfloat16 takes longer.
+    On a CPU the last layer is computed in float32, since bfloat16 is slower with few channels.
     """
     last = decoder.layers[-1]
     assert isinstance(last, UpConv)

@@ -1,8 +1,7 @@
-"""Many rows in pieces, on a CPU.
+"""Process many rows in chunks, on a CPU.
 
-glibc's malloc does not keep blocks of more than 32 MB but returns them to the system, which zeroes
-them page by page at the next call. That takes about as long as the arithmetic, so the largest
-tensors are kept smaller.
+glibc's malloc returns blocks of more than 32 MB to the system, which zeroes them page by page at
+the next allocation. That takes about as long as the arithmetic, so tensors are kept smaller.
 """
 
 from collections.abc import Callable
@@ -15,17 +14,17 @@ from wpt_agents.fast.products import IMAGES
 from wpt_agents.model.ops import over_rows
 from wpt_agents.model.rssm import Latent, over_steps
 
-PIECE = 2**22  # numbers in the largest tensor of a piece: 16 MB of float32
+PIECE = 2**22  # elements in the largest tensor of a chunk: 16 MB of float32
 
 
 def rows_of_a_piece(row_size: int) -> int:
-    """Return how many rows are computed at a time, as a multiple that a convolution can take."""
+    """Return the number of rows per chunk, as a multiple that convolutions accept."""
     rows = max(1, PIECE // row_size)
     return rows - rows % IMAGES if rows > IMAGES else rows
 
 
 def has_many_rows(layers: Callable[..., Tensor], row_size: int, *inputs: Tensor) -> bool:
-    """Return whether the rows do not fit into one piece, on a CPU."""
+    """Return whether the rows do not fit into one chunk, on a CPU."""
     return on_cpu(inputs[0]) and len(inputs[0]) > rows_of_a_piece(row_size)
 
 

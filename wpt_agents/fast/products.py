@@ -1,8 +1,9 @@
-"""Products of matrices: as convolutions on AMD's CPUs, and with fewer copies everywhere.
+"""Matrix products: as convolutions on AMD CPUs, and with fewer copies everywhere.
 
-oneDNN, which computes torch's convolutions on a CPU, uses AVX-512 wherever a CPU has it. MKL, which
-computes torch's products of matrices, does not use it on AMD's CPUs and reaches half the speed on
-the newest of them (docs/speed.md). So products of many rows are written as 1x1 convolutions there.
+oneDNN, which computes torch's convolutions on a CPU, uses AVX-512 on every CPU that supports it.
+MKL, which computes torch's matrix products, does not use it on AMD CPUs and reaches half the speed
+on the newest of them (docs/speed.md). There, products of many rows are computed as 1x1
+convolutions.
 """
 
 import platform
@@ -16,13 +17,13 @@ from torch import Tensor
 from wpt_agents.fast.conditions import always, on_cpu
 from wpt_agents.model.ops import block_linear, linear, shared_block_linear
 
-MANY = 256  # rows from which on a convolution repays the reordering of its weights; measured
-WORK = 2**22  # and multiplications from which on it does
-IMAGES = 16  # torch passes a convolution of fewer images to MKL, too
+MANY = 256  # minimum rows for a convolution to be faster despite reordering weights (measured)
+WORK = 2**22  # minimum number of multiplications for the same
+IMAGES = 16  # torch uses MKL for convolutions of fewer images, too
 
 
 def cpu_model() -> str:
-    """Return what the system says of the processor, including its maker."""
+    """Return the system's description of the processor, including its vendor."""
     info = Path("/proc/cpuinfo")
     return info.read_text(encoding="utf-8") if info.exists() else platform.processor()
 
@@ -35,7 +36,7 @@ AMD_AVX512 = (
 
 
 def faster_by_convolution(x: Tensor, width: int) -> bool:
-    """Return whether `product_by_convolution` is the faster way.
+    """Return whether `product_by_convolution` is faster.
 
     :param x: (..., inputs)
     :param width: the number of outputs that each input contributes to
@@ -48,7 +49,7 @@ def faster_by_convolution(x: Tensor, width: int) -> bool:
         and rows >= MANY
         and rows % IMAGES == 0
         and x.numel() * width >= WORK
-        and not torch.is_autocast_enabled("cpu")  # in bfloat16 oneDNN computes the products, too
+        and not torch.is_autocast_enabled("cpu")  # in bfloat16 oneDNN also computes matrix products
     )
 
 
@@ -61,7 +62,7 @@ def product_by_convolution(
     :param weight: (outputs, inputs / blocks), the blocks of a block-diagonal matrix one below the
         other
     """
-    # a permuted view, so that the channels of a pixel are adjacent in memory and nothing is copied
+    # a permuted view without a copy: the channels of a pixel are contiguous in memory
     pixels = x.reshape(IMAGES, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
     out = F.conv2d(pixels, weight[..., None, None], bias, groups=blocks)
     return out.permute(0, 2, 3, 1).flatten(0, 2)
@@ -91,7 +92,7 @@ def block_linear_by_convolution(x: Tensor, weight: Tensor, bias: Tensor | None =
 
 @block_linear.faster(when=always)
 def block_linear_by_bmm(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """`block_linear` as one batched product that adds the bias, too."""
+    """`block_linear` as one batched product that includes the bias."""
     blocks = x.unflatten(-1, (len(weight), -1)).transpose(0, 1)
     if bias is None:
         return torch.bmm(blocks, weight).transpose(0, 1).flatten(1)
@@ -100,7 +101,7 @@ def block_linear_by_bmm(x: Tensor, weight: Tensor, bias: Tensor | None = None) -
 
 
 def weights_are_fewer(private: Tensor, shared: Tensor, weight: Tensor, *_: Any, **__: Any) -> bool:
-    """Return whether the weights of the shared inputs are fewer than the copies of these inputs."""
+    """Return whether copying the shared inputs' weights is cheaper than copying the inputs."""
     outputs = weight.shape[0] * weight.shape[2]
     return len(private) * len(weight) >= outputs
 
@@ -111,8 +112,8 @@ def shared_block_linear_by_two_products(
 ) -> Tensor:
     """`shared_block_linear` with the weights of the shared inputs as one matrix.
 
-    The matrix is a copy of these weights in another order. The definition copies the shared inputs
-    once for each block instead.
+    The matrix is a reordered copy of these weights, while the original function copies the shared
+    inputs once for each block.
     """
     inputs = private.shape[1] // len(weight)  # of a block
     matrix = weight[:, inputs:].transpose(0, 1).flatten(1)

@@ -1,10 +1,10 @@
-"""`filter_sequence` with its gradients written out, for training on a CPU.
+"""`filter_sequence` with manual gradients, for training on a CPU.
 
-Autograd would go back through about 400 small operators a step and add up every weight's gradient
-step by step. Here a step back takes about 30 operators, for the gradients of the states alone. What
-each layer saw and the slopes at its outputs are kept (tape.py), and each weight gets its gradient
-at the end, from one product over all steps. A GPU would gain less: it computes small
-operators while Python is already at the next ones.
+Autograd's backward pass has about 400 small operators per step, and accumulates the gradients of
+all weights step by step. Here a backward step has about 30 operators, which compute only the
+gradients of the states. The inputs of each layer and the gradients at its outputs (slopes) are
+stored (tape.py), and each weight's gradient is computed at the end with one product over all steps.
+A GPU would gain less, because it computes small operators while Python launches the next ones.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ aten = torch.ops.aten
 
 
 class Constants(NamedTuple):
-    """What a scan needs besides its weights; see `Size`."""
+    """The settings of a scan besides its weights; see `Size`."""
 
     unimix: float
     gates: str
@@ -30,7 +30,7 @@ class Constants(NamedTuple):
 
 
 class Steps:
-    """All layers of a step, made of weights in the order in which `scan` passes them."""
+    """All layers of a step, built from the weights in the order in which `scan` passes them."""
 
     def __init__(self, constants: Constants, weights: tuple[Tensor, ...]) -> None:
         w = iter(weights)
@@ -62,7 +62,7 @@ class Steps:
     def forward(
         self, deter: Tensor, stoch: Tensor, action_half: Tensor, embed_half: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Make one step: the new h (N, D) and the posterior's probabilities (N, S, K)."""
+        """Compute one step: the new h (N, D) and the posterior's probabilities (N, S, K)."""
         blocks = len(self.private.weight)
         from_deter = self.deter_norm.forward(self.deter_in.forward(deter))
         from_stoch = self.stoch_norm.forward(self.stoch_in.forward(stoch.flatten(1)))
@@ -80,7 +80,7 @@ class Steps:
         return deter, mixed
 
     def backward(self, t: int, to_deter: Tensor, to_probs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the slopes at the h (N, D) and z (N, S, K) that step t began with.
+        """Return the slopes at the h (N, D) and z (N, S, K) from which step t started.
 
         :param to_deter: (N, D), the slope at the new h, without the part through the posterior
         :param to_probs: (N, S, K), the slope at the unmixed probabilities
@@ -119,7 +119,7 @@ class FilterScan(torch.autograd.Function):
         """Filter a sequence.
 
         :param is_first: (T, B) bool
-        :param action_half: (T, B, D), what the actions and the bias add before the GRU's norm
+        :param action_half: (T, B, D), the contribution of actions and bias before the GRU's norm
         :param embed_half: (T, B, hidden), what images and bias add before the posterior's norm
         :param deter: (B, D), h before the first image
         :param stoch: (B, S, K), z before the first image
@@ -135,7 +135,7 @@ class FilterScan(torch.autograd.Function):
                 stoch = stoch * keep[t, :, None, None]
             deter, probs = steps.forward(deter, stoch, action_half[t], embed_half[t])
             index = (probs / exponential(probs, generator)).argmax(-1, keepdim=True)
-            stoch = torch.zeros_like(probs).scatter_(-1, index, 1.0)  # as `sample_one_hot`
+            stoch = torch.zeros_like(probs).scatter_(-1, index, 1.0)  # same as `sample_one_hot`
             deters.append(deter)
             stochs.append(stoch)
         ctx.steps, ctx.keep, ctx.resets = steps, keep, resets
@@ -147,11 +147,11 @@ class FilterScan(torch.autograd.Function):
     def backward(
         ctx: Any, to_deters: Tensor, to_stochs: Tensor, to_logits: Tensor
     ) -> tuple[Tensor | None, ...]:
-        """Return the gradients of what `forward` took."""
+        """Return the gradients of the arguments of `forward`."""
         steps: Steps = ctx.steps
         for layer in steps.layers:
-            layer.slopes.clear()  # of an earlier way back through the same graph
-        share = 1 - steps.unimix  # the slope of the mixed probabilities at the unmixed ones
+            layer.slopes.clear()  # from an earlier backward pass through the same graph
+        share = 1 - steps.unimix  # the derivative of the mixed probabilities by the unmixed ones
         # z has the gradient of the probabilities (straight-through), and their logarithm is the
         # third output
         to_probs = (to_stochs + to_logits / ctx.mixed) * share
@@ -194,7 +194,7 @@ def scan(
     generator: Noise = None,
     sample: bool = True,
 ) -> tuple[Latent, Tensor]:
-    """`filter_sequence` in far fewer operators, always in float32."""
+    """`filter_sequence` with far fewer operators, always in float32."""
     with torch.autocast("cpu", enabled=False):  # it does not know `FilterScan`
         return _scan(rssm, embed_half.float(), action_embed.float(), is_first, state, generator)
 

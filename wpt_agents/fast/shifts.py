@@ -1,4 +1,4 @@
-"""Shifted images by copies of whole rows of pixels, where a gather moves pixel by pixel."""
+"""Shift images by copying whole rows of pixels instead of gathering single pixels."""
 
 import torch
 from torch import Tensor
@@ -9,11 +9,11 @@ from wpt_agents.model.behavior_cloning import shifted
 
 
 def is_on_cpu_without_gradient(image: Tensor, shift: Tensor, pad: int) -> bool:
-    """Return whether NumPy can move the pixels: on a CPU, without a gradient."""
+    """Return whether NumPy can shift the images: on a CPU, without gradients."""
     return on_cpu(image) and not image.requires_grad
 
 
 @shifted.faster(when=is_on_cpu_without_gradient)
 def shifted_by_cuts(image: Tensor, shift: Tensor, pad: int) -> Tensor:
-    """`shifted` as images cut out of wider ones."""
+    """`shifted`, by cropping padded images."""
     return torch.from_numpy(cut_shifted(image.numpy(), shift.numpy() + pad, pad))

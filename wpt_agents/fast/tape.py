@@ -1,4 +1,4 @@
-"""Layers whose way back is written out: they record what they saw and what came back, step by step.
+"""Layers with manual gradients, which record their inputs and the gradients at their outputs.
 
 The gradients at a layer's outputs are called slopes here.
 """

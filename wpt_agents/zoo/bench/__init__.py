@@ -1,1 +1,1 @@
-"""What the library costs, measured: one module a subject, each with `rows`."""
+"""Benchmarks of the library: one module per subject, each with a function `rows`."""

@@ -1,4 +1,4 @@
-"""The dataset against other formats, and at the paper's scale: size, speed and memory.
+"""Compare the dataset with other formats, and measure it at the paper's scale.
 
 Times are CPU time of this process, all its threads, with the files in the page cache.
 """
@@ -34,15 +34,15 @@ DMC = [
 METAWORLD = [
     f"wpt/metaworld-{n}-v0" for n in ("drawer-close", "button-press-topdown", "assembly", "hammer")
 ]
-STEPS = 167  # so that 60,000 trajectories make the paper's 10 million transitions
+STEPS = 167  # so that 60,000 trajectories have the paper's 10 million transitions
 NEAR = {"rendering": "near"}
 
 
 def rows(quick: bool = False, folder: Path | None = None) -> Rows:
-    """A row a case; see `compare`, `sampling` and `large_store` for what stands in it.
+    """Yield a row for each case; see `compare`, `sampling` and `large_store` for the columns.
 
-    :param quick: few and synthetic frames, a small store: whether it runs, not how fast
-    :param folder: where to keep frames and stores (6 GB); what is there already is used again
+    :param quick: use few synthetic frames and a small store, only to check that it runs
+    :param folder: the folder of frames and stores (6 GB); existing ones are reused
     """
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         path = Path(place)
@@ -59,7 +59,7 @@ def rows(quick: bool = False, folder: Path | None = None) -> Rows:
 
 
 def synthetic(count: int, steps: int, seed: int = 0) -> list[Trajectory]:
-    """Sprites that drift over a patchwork, with noise on 64 bytes an image."""
+    """Sprites that move over a patchwork, with noise on 64 bytes per image."""
     rng = np.random.default_rng(seed)
     return [_synthetic(rng, steps) for _ in range(count)]
 
@@ -81,7 +81,7 @@ def _synthetic(rng: np.random.Generator, steps: int) -> Trajectory:
 
 
 def collected(path: Path) -> dict[str, list[Trajectory]]:
-    """8 episodes of DMControl, 20 of Meta-World, and these again as a noisy camera sees them."""
+    """8 episodes of DMControl, 20 of Meta-World, and the latter with camera noise."""
     dmc = collect(path / "dmc", DMC, 2, workers=1, env=NEAR)
     metaworld = collect(path / "mw", METAWORLD, 5, workers=1, behaviour="scripted", env=NEAR)
     rng = np.random.default_rng(0)
@@ -94,12 +94,12 @@ def _noisy(image: np.ndarray, rng: np.random.Generator, sigma: float = 2.0) -> n
 
 
 def compare(name: str, trajectories: Sequence[Trajectory], draws: int) -> Rows:
-    """Each format on the same frames: bytes a frame, ratio to raw, error, speeds."""
+    """Measure each format on the same frames: bytes per frame, ratio to raw, error, speeds."""
     for form in FORMATS:
         what = {"what": "format", "frames": name, "format": form}
         package = FORMATS[form][1]
         if find_spec(package) is not None:
-            import_module(package)  # not in the time it takes to write
+            import_module(package)  # excluded from the time of writing
             with TemporaryDirectory() as place:
                 yield what | _measure(Path(place), form, trajectories, draws)
         else:
@@ -142,7 +142,7 @@ def _windows(windows: Windows, read: Read, seed: int) -> torch.Tensor:
 
 
 def _seconds(draw: Callable[[int], object], draws: int) -> float:
-    """CPU seconds a draw, after one that is not counted."""
+    """Return the CPU seconds per draw, after one warm-up draw."""
     draw(0)
     began = time.process_time()
     for k in range(1, draws + 1):
@@ -151,7 +151,7 @@ def _seconds(draw: Callable[[int], object], draws: int) -> float:
 
 
 def sampling(trajectories: Sequence[Trajectory], size: str, updates: int) -> Rows:
-    """CPU time of a B16 x T64 batch beside that of one world-model update on it."""
+    """Compare the CPU time of a B16 x T64 batch with that of a world-model update on it."""
     with TemporaryDirectory() as place:
         store(Path(place), trajectories, "zstd")
         dataset = TrajectoryDataset.open(Path(place) / "store")
@@ -176,7 +176,7 @@ def sampling(trajectories: Sequence[Trajectory], size: str, updates: int) -> Row
 
 
 def large_store(path: Path, count: int, copies: int, workers: Sequence[int]) -> Rows:
-    """A store of `count` synthetic trajectories, `copies` times over, in a process of its own."""
+    """Measure a store of `count` synthetic trajectories, each `copies` times, in a new process."""
     make_store(path, count, copies)
     for threads in workers:
         with worker_pool(1) as pool:
@@ -184,7 +184,7 @@ def large_store(path: Path, count: int, copies: int, workers: Sequence[int]) -> 
 
 
 def make_store(path: Path, count: int, copies: int) -> None:
-    """The same `count` trajectories `copies` times; what is there of them already is kept."""
+    """Write `count` trajectories `copies` times; existing ones are kept."""
     with TrajectoryDataset.open_or_create(path.with_name(f"{path.name}-base")) as base:
         base.extend(synthetic(count, STEPS)[len(base) :])
     with TrajectoryDataset.open_or_create(path) as dataset:
@@ -193,7 +193,7 @@ def make_store(path: Path, count: int, copies: int) -> None:
 
 
 def use_store(path: Path, workers: int, draws: int = 50) -> dict[str, Any]:
-    """Opens a store and samples: seconds, windows a second, and resident memory above before."""
+    """Open a store and sample: seconds, windows per second, and additional resident memory."""
     before = memory_mib("VmRSS")
     began = time.process_time()
     dataset = TrajectoryDataset.open(path, workers)

@@ -1,4 +1,4 @@
-"""What a step of an environment costs, beside the renderers of dm_control and Gymnasium."""
+"""The cost of an environment step, compared with the renderers of dm_control and Gymnasium."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -10,7 +10,7 @@ _USUAL = {"dmc": "dm_control", "metaworld": "gymnasium"}
 
 
 def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
-    """CPU ms an agent step (two control steps and one picture of 64 x 64), a row a renderer.
+    """Yield the CPU time in ms of an agent step (two control steps, one 64 x 64 image) by renderer.
 
     :param quick: one round instead of five
     """

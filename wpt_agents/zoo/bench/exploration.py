@@ -1,11 +1,11 @@
-"""How much of the walker's states each way of exploring sees, at equal frames.
+"""State coverage of the walker by each exploration method, at equal numbers of frames.
 
 The measure: cells of a histogram over torso height (0 to 1.6 m, 16 bins), pitch (a full turn, 24
-bins) and horizontal speed (-4 to 4 m/s, 16 bins) that at least one step ended in; what lies outside
-counts in the outermost bins.
+bins) and horizontal speed (-4 to 4 m/s, 16 bins) that at least one step ended in; values outside
+the range count in the outermost bins.
 
-Frames are those of the episodes that a dataset would hold. `explore-state` learns before, from the
-simulator's state alone, and plays the policies of five stages of that in turn.
+Only the frames of recorded episodes count. `explore-state` first learns from the simulator's state
+alone, and then alternates between the policies of five stages of its training.
 """
 
 import time
@@ -42,7 +42,7 @@ LOW, HIGH, BINS = np.array([0, -np.pi, -4]), np.array([1.6, np.pi, 4]), np.array
 
 
 class Watched(gym.Wrapper):
-    """Keeps the simulator's state after every step."""
+    """Record the simulator's state after every step."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -56,7 +56,7 @@ class Watched(gym.Wrapper):
 
 
 def coverage(states: np.ndarray) -> int:
-    """How many cells the walker's states lie in.
+    """Return the number of cells that contain the walker's states.
 
     :param states: (N, 24), dm_control's observation: xx and xz of each body's orientation, the
         torso's first; the torso's height; the joints' velocities, of which the second is rootx's
@@ -68,9 +68,9 @@ def coverage(states: np.ndarray) -> int:
 
 
 def explore(behaviour: str, seed: int, episodes: int, **settings: Any) -> np.ndarray:
-    """The states (N, 24) that a way of exploring passes through."""
+    """Return the states (N, 24) that an exploration method visits."""
     learns = behaviour in EXPLORERS
-    size = 64 if learns else 16  # who does not look needs no picture
+    size = 64 if learns else 16  # these behaviours need no images
     stages = []
     if behaviour == STATE_CURIOSITY:
         stages = [state_policy(w) for w in explore_states(TASK, ENV, settings["steps"], seed)]
@@ -94,9 +94,9 @@ def explore(behaviour: str, seed: int, episodes: int, **settings: Any) -> np.nda
 def rows(
     quick: bool = False, behaviours: Sequence[str] = BEHAVIOURS, steps: int = STEPS
 ) -> Iterator[dict[str, Any]]:
-    """The cells that each behaviour occupies, seed by seed.
+    """Yield the number of cells that each behaviour visits, for each seed.
 
-    :param steps: calls of `env.step` in which `explore-state` learns
+    :param steps: calls of `env.step` during the training of `explore-state`
     """
     for behaviour in behaviours:
         if behaviour not in BEHAVIOURS:

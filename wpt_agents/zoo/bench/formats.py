@@ -1,4 +1,4 @@
-"""Ways to keep trajectories' images, each written and read as its own documentation has it.
+"""Formats for images of trajectories, written and read as their documentation recommends.
 
 A format is a function that writes trajectories into a folder and returns a `Read`.
 """
@@ -33,7 +33,7 @@ def memmap(path: Path, trajectories: Sequence[Trajectory]) -> Read:
 
 
 def hdf5(path: Path, trajectories: Sequence[Trajectory], **how: Any) -> Read:
-    """A dataset a trajectory, in chunks of 16 images."""
+    """One dataset per trajectory, in chunks of 16 images."""
     h5py = import_module("h5py")
     with h5py.File(path / "data.hdf5", "w") as file:
         for i, trajectory in enumerate(trajectories):
@@ -45,7 +45,7 @@ def hdf5(path: Path, trajectories: Sequence[Trajectory], **how: Any) -> Read:
 
 
 def zarr(path: Path, trajectories: Sequence[Trajectory]) -> Read:
-    """An array a trajectory, in chunks of 16 images, zstd as zarr sets it."""
+    """One array per trajectory, in chunks of 16 images, with zarr's default zstd."""
     group = import_module("zarr").open_group(str(path / "data.zarr"), mode="w")
     for i, trajectory in enumerate(trajectories):
         image = trajectory.image
@@ -57,7 +57,7 @@ def zarr(path: Path, trajectories: Sequence[Trajectory]) -> Read:
 
 
 def npz(path: Path, trajectories: Sequence[Trajectory]) -> Read:
-    """A compressed .npz a trajectory, as ExORL and DrQ-v2 keep theirs."""
+    """One compressed .npz file per trajectory, as in ExORL and DrQ-v2."""
     for i, trajectory in enumerate(trajectories):
         np.savez_compressed(path / f"{i}.npz", observation=trajectory.image)
 
@@ -86,7 +86,7 @@ def minari(path: Path, trajectories: Sequence[Trajectory]) -> Read:
     ]
     environment = mock.patch.dict("os.environ", MINARI_DATASETS_PATH=str(path))
     with environment, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it wants author, code, e-mail
+        warnings.simplefilter("ignore")  # it warns about missing author, code and e-mail
         made = minari.create_dataset_from_buffers(
             "bench/frames-v0",
             buffers,
@@ -97,7 +97,7 @@ def minari(path: Path, trajectories: Sequence[Trajectory]) -> Read:
 
 
 def store(path: Path, trajectories: Sequence[Trajectory], codec: str) -> Read:
-    """The one of this library."""
+    """The format of this library."""
     with TrajectoryDataset.create(path / "store", codec=codec) as dataset:
         dataset.extend(trajectories)
     return lambda i, start, stop: dataset[i].image[start:stop]

@@ -1,8 +1,8 @@
-"""Pre-training and whole updates on a GPU: seconds, peak memory, and how long the GPU waits.
+"""Pre-training and whole updates on a GPU: time, peak memory, and idle time of the GPU.
 
-On a GPU a step can be limited by arithmetic or by launches: the CPU calls one operator after the
-other, and the GPU waits where calling an operator takes longer than computing it. The profiler says
-how long kernels ran. The rest of the wall-clock time is the share of launches.
+On a GPU a step can be limited by arithmetic or by launches: the CPU launches the operators one by
+one, and the GPU is idle while launching takes longer than computing. The profiler measures the
+kernel time; the rest of the wall-clock time is the share of launches.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,16 +21,16 @@ REPETITIONS = 10  # timed steps after a warm-up of 3
 def rows(quick: bool = False, precision: str = "fp32", compiled: bool = False) -> Iterator[dict]:
     """One row for a step of pre-training, and one for a whole update, at the paper's size.
 
-    `kernel_s` is the time in which the GPU computed, `launch_share` that of the step in which it
-    waited, and `launches` the operators that a step calls.
+    `kernel_s` is the computing time of the GPU, `launch_share` the share of the step in which it is
+    idle, and `launches` the number of operators that a step calls.
 
-    :param quick: the size debug, on whatever device there is
-    :raises ValueError: no GPU, unless `quick`
+    :param quick: use the size debug on any device
+    :raises ValueError: if there is no GPU, unless `quick`
     """
     if not quick and not torch.cuda.is_available():
         raise ValueError(
-            "bench gpu measures a GPU, and torch finds none (torch.cuda.is_available() is False). "
-            "--quick tries the same code on this machine's CPU"
+            "bench gpu needs a GPU, and torch finds none (torch.cuda.is_available() is False). "
+            "--quick runs the same code on this machine's CPU"
         )
     size, batch, length = ("debug", 2, 8) if quick else ("paper", 16, 64)
     model = agent(size, precision, compiled)
@@ -51,7 +51,7 @@ def rows(quick: bool = False, precision: str = "fp32", compiled: bool = False) -
 def measured(
     step: Callable[[], Any], counted: Callable[[], Any], quick: bool = False
 ) -> dict[str, float]:
-    """Measure a step, after it has run often enough to be compiled and cached.
+    """Measure a step after a warm-up for compilation and caches.
 
     :param counted: the same step uncompiled, whose work is counted
     """
@@ -73,7 +73,7 @@ def measured(
 
 
 def kernel_seconds(step: Callable[[], Any]) -> float:
-    """Return how long kernels ran in a call of `step`, 0 without a GPU."""
+    """Return the kernel time of a call of `step`, 0 without a GPU."""
     if not torch.cuda.is_available():
         step()
         return 0.0

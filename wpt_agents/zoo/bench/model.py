@@ -1,4 +1,4 @@
-"""The gradient steps: world model alone, and all networks."""
+"""Gradient steps: of the world model alone, and of all networks."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -30,7 +30,7 @@ CASES = (  # size, batch, length; `bench scaling` shows what grows with each
 def rows(
     quick: bool = False, threads: int = 1, precision: str = "fp32", compiled: bool = False
 ) -> Iterator[dict]:
-    """One row a case; `quick` takes the debug size and one repetition."""
+    """Yield a row for each case; `quick` uses the debug size and one repetition."""
     torch.set_num_threads(threads)
     for case in (("debug", 2, 8),) if quick else CASES:
         yield from updates(*case, precision, 1 if quick else 5, compiled)
@@ -39,7 +39,7 @@ def rows(
 def updates(
     size: str, batch: int, length: int, precision: str, repetitions: int, compiled: bool = False
 ) -> Iterator[dict[str, Any]]:
-    """A row for the world model's step, and one for the whole update."""
+    """Yield a row for the world model's step, and one for the whole update."""
     model = agent(size, precision, compiled)
     plain = agent(size, precision) if compiled else model
     data = synthetic_batch(batch, length).to(model.device)
@@ -56,7 +56,7 @@ def updates(
 
 
 def count(*networks: nn.Module) -> int:
-    """The parameters of the networks."""
+    """Return the number of parameters of the networks."""
     return sum(p.numel() for net in networks for p in net.parameters())
 
 
@@ -65,11 +65,11 @@ def measured_in_turn(
     repetitions: int,
     counted: Sequence[Callable[[], Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """A row for each of several steps, which take turns with the ceiling: time, work, memory.
+    """Yield a row for each step, alternating with the ceiling: time, work, memory.
 
-    With several threads of a CPU a step takes turns with itself on one, too: `times_one_thread`.
+    With several CPU threads, each step is also timed on a single thread: `times_one_thread`.
 
-    :param counted: the same steps uncompiled, to count their work, which compiled code hides
+    :param counted: the same steps uncompiled, because the work of compiled code cannot be counted
     """
     steps, threads = [step for step, _ in cases], torch.get_num_threads()
     work = [gflop(step) for step in counted or steps]
@@ -106,7 +106,7 @@ def measured_in_turn(
 
 
 def on_one_thread(step: Callable[[], Any]) -> Callable[[], None]:
-    """The step with a single thread of torch."""
+    """Return the step with a single thread of torch."""
 
     def alone() -> None:
         threads = torch.get_num_threads()
@@ -126,12 +126,12 @@ def _peak_mb(step: Callable[[], Any]) -> float:
 
 
 def agent(size: str, precision: str = "fp32", compiled: bool = False) -> WPT:
-    """An agent of six actions that has seen nothing."""
+    """Return an untrained agent with six actions."""
     return WPT(size=size, max_action_dim=ACTIONS, precision=precision, compile=compiled, seed=0)
 
 
 def synthetic_batch(batch: int, length: int) -> Batch:
-    """Noise of the right shapes, one episode's beginning in each row."""
+    """Return noise of the right shapes, with the start of an episode in each row."""
     generator = torch.Generator().manual_seed(0)
     shape = batch, length
     is_first = torch.zeros(shape, dtype=torch.bool)
@@ -148,17 +148,17 @@ def synthetic_batch(batch: int, length: int) -> Batch:
 
 
 def world_model_step(model: WPT, batch: Batch, learn_reward: bool = False) -> Callable[[], Any]:
-    """A pre-training step on `batch`; with `learn_reward` the reward head learns too."""
+    """Return a pre-training step on `batch`; `learn_reward` includes the reward head."""
     return lambda: model.learner.update_world_model(batch, generator(model), learn_reward)
 
 
 def whole_step(model: WPT, batch: Batch) -> Callable[[], Any]:
-    """`WPT.update` on `batch`: world model, reward, imagination, actor and critic."""
+    """Return `WPT.update` on `batch`: world model, reward, imagination, actor and critic."""
     return lambda: model.learner.update(batch, generator(model))
 
 
 def imagined_states(model: WPT, batch: Batch) -> int:
-    """Return how many states an update imagines: its starts (`imagine_starts`) times its steps."""
+    """Return the number of imagined states of an update: `imagine_starts` times the horizon."""
     starts = model.learner.draw_starts(batch, generator(model))
     return len(starts) * model.imagine_horizon
 

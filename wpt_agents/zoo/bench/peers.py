@@ -1,7 +1,7 @@
-"""Other libraries' DreamerV3 beside ours: their own models and training steps on the same batch.
+"""Compare with the DreamerV3 of other libraries: their models and training steps on the same batch.
 
-An adapter builds the peer's model by the peer's own code, as wide as ours wherever its
-configuration has the same words, and imports the peer when it is called.
+An adapter builds the peer's model with the peer's own code, with our widths wherever its
+configuration has the same options, and imports the peer when it is called.
 """
 
 import runpy
@@ -38,23 +38,23 @@ HORIZON = 15  # imagined steps in the peers' own configurations
 
 
 class Learner(NamedTuple):
-    """What learns: its name, how much of it there is, and its training steps.
+    """A learner: its name, its size, and its training steps.
 
-    The first of two is the world model's with the reward head, the second the whole update.
+    The first step trains the world model with the reward head, the second is the whole update.
     """
 
     name: str
     params: tuple[int, int]
-    imagined: int  # states in an update: its starts times its steps
+    imagined: int  # imagined states in an update: starts times steps
     steps: tuple[Callable[[], Any], Callable[[], Any]]
 
 
 def rows(
     peer: str, quick: bool = False, threads: int = 1, precision: str = "fp32"
 ) -> Iterator[dict[str, Any]]:
-    """Ours and the peer's in turn, the world model's step and the whole update.
+    """Measure our steps and the peer's alternately: world model, and whole update.
 
-    :raises ValueError: the peer is not installed, or something but fp32 on a CPU was asked for
+    :raises ValueError: if the peer is not installed, or for anything but fp32 on a CPU
     """
     if precision != "fp32":
         raise ValueError(f"--peer measures in fp32, not in {precision}: leave --precision out")
@@ -77,7 +77,7 @@ def rows(
 
 
 def ours(model: WPT, batch: Batch) -> Learner:
-    """Ours; the reward head learns with the world model, as the peers' does."""
+    """Our learner; the reward head is trained with the world model, as in the peers."""
     nets = model.policy.world_model, model.policy.actor, model.policy.critic
     return Learner(
         "wpt_agents",
@@ -88,14 +88,14 @@ def ours(model: WPT, batch: Batch) -> Learner:
 
 
 def needed(name: str) -> ModuleType:
-    """A module of a peer, or of what it is made with."""
+    """Import a module of a peer, or of its dependencies."""
     return import_extra(name, "peers")
 
 
 def sheeprl(size: Size, batch: Batch) -> Learner:
-    """Its `dreamer_v3`, the architecture of 2023, with its own training functions."""
+    """The `dreamer_v3` of sheeprl, with the architecture of 2023 and its own training functions."""
     theirs = needed("sheeprl.algos.dreamer_v3.dreamer_v3")
-    theirs.MetricAggregator.disabled = True  # no statistics for a log
+    theirs.MetricAggregator.disabled = True  # without logging statistics
     cfg, fabric = sheeprl_config(size), theirs.Fabric(accelerator="cpu", devices=1)
     world, actor, critic, target, _ = theirs.build_agent(
         fabric, (ACTIONS,), True, cfg, Dict({"rgb": Box(0, 255, (3, 64, 64), np.uint8)})
@@ -119,7 +119,7 @@ def sheeprl(size: Size, batch: Batch) -> Learner:
 
 
 def sheeprl_config(size: Size) -> Any:
-    """Its defaults with our widths; two layers in the heads bring the count nearest to ours."""
+    """Return its defaults with our widths; two layers per head give the closest parameter count."""
     widths = {
         "dense_units": size.units,
         "mlp_layers": 2,
@@ -145,7 +145,7 @@ def sheeprl_batch(batch: Batch) -> dict[str, torch.Tensor]:
     """Its layout: time first, channels first, all float32."""
     streams = {
         "rgb": batch.image.permute(0, 1, 4, 2, 3),
-        "actions": batch.action.roll(-1, 1),  # it pairs an image with the action that follows
+        "actions": batch.action.roll(-1, 1),  # it pairs each image with the following action
         "rewards": batch.reward[..., None],
         "terminated": batch.is_terminal[..., None],
         "is_first": batch.is_first[..., None],
@@ -154,7 +154,7 @@ def sheeprl_batch(batch: Batch) -> dict[str, torch.Tensor]:
 
 
 def torchrl(size: Size, batch: Batch) -> Learner:
-    """The DreamerV3 of its `sota-implementations`, which its wheel brings along."""
+    """The DreamerV3 of torchrl's `sota-implementations`, which its wheel includes."""
     cfg = needed("omegaconf").OmegaConf.create(torchrl_config(size))
     with torchrl_example() as example, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -179,7 +179,7 @@ def torchrl(size: Size, batch: Batch) -> Learner:
 
 @contextmanager
 def torchrl_example() -> Iterator[dict[str, Any]]:
-    """The names that its training script defines; its neighbours are importable meanwhile."""
+    """Return the names that its training script defines; modules beside it can be imported."""
     library = needed("torchrl")
     folder = Path(str(library.__file__)).parents[1] / "sota-implementations" / "dreamer_v3"
     if not (folder / "train.py").exists():
@@ -195,9 +195,9 @@ def torchrl_example() -> Iterator[dict[str, Any]]:
 
 
 def torchrl_config(size: Size) -> dict[str, Any]:
-    """Its `networks`, `optimization` and `env`, with our widths where it has the words."""
+    """Return its `networks`, `optimization` and `env` options, with our widths where possible."""
     networks = {
-        "hidden_dim": 2 * size.hidden,  # of heads too; brings the world model's count to ours
+        "hidden_dim": 2 * size.hidden,  # of heads, too; matches our parameter count
         "rnn_hidden_dim": size.deter,
         "num_categoricals": size.stoch,
         "num_classes": size.classes,
@@ -223,7 +223,7 @@ def torchrl_config(size: Size) -> dict[str, Any]:
         **{"slow_critic_regularization": 1.0, "slow_critic_tau": 0.02, "lr": 4e-5},
         **{"adaptive_grad_clip": 0.3, "optimizer_eps": 1e-20, "warmup_steps": 1000},
     }
-    env = {  # asked only for how wide its actions are: six
+    env = {  # used only for its action width, six
         **{"backend": "gym", "name": "HalfCheetah-v5", "seed": 0, "use_seed": False},
         **{"max_episode_steps": 1000, "vector_key": "observation", "pixels_key": "pixels"},
     }

@@ -13,9 +13,10 @@ from wpt_agents.zoo.bench.timing import cost, peak_rss_mb, seconds_in_turn
 
 
 def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
-    """A row a size, number of environments and form; params are those that acting uses.
+    """Yield a row for each size, number of environments and implementation.
 
-    The definitions and their faster twins take turns.
+    `params` counts the parameters used for acting. The original and the fast implementation are
+    timed alternately.
     """
     torch.set_num_threads(threads)
     sizes, counts = (("debug",), (1,)) if quick else (("tiny", "small", "medium"), (1, 4, 16))
@@ -47,6 +48,6 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
 
 
 def by_definition(act: Callable[[], Any]) -> None:
-    """Act without any faster twin."""
+    """Act without the fast implementations."""
     with definitions():
         act()

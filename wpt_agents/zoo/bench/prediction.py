@@ -1,4 +1,4 @@
-"""How far off a generalist's open-loop predictions are, and specialists', on five robots.
+"""Open-loop prediction errors of a generalist and of specialists on five robots.
 
 Data, models, errors and pictures are kept in `runs/bench/prediction`.
 """
@@ -30,20 +30,20 @@ FOLDER = Path("runs") / "bench" / "prediction"
 DMC = ("walker-run", "cheetah-run", "cartpole-swingup", "quadruped-run")
 METAWORLD = ("drawer-close", "door-open", "button-press-topdown", "window-open")
 LOOK = {"rendering": "fast"}
-LEFT_OUT = "walker"  # from one generalist's pre-training
+LEFT_OUT = "walker"  # from the pre-training of one generalist
 
 
 class Plan(NamedTuple):
-    """How much of everything."""
+    """The sizes of data and training."""
 
     folder: Path
     tasks: Sequence[str]
     behaviour: str
-    episodes: int  # of each task, each with a seed of its own
-    held_out: int  # how many of them are not trained on, counted from the last
+    episodes: int  # of each task, each with its own seed
+    held_out: int  # the last ones, which are not used for training
     windows: int  # of each held-out trajectory
     updates: int
-    further: int  # updates on the robot that was left out
+    further: int  # updates on the robot that was excluded
     model: Mapping[str, Any]
 
 
@@ -51,7 +51,7 @@ BATCH = {"max_action_dim": 12, "batch_size": 8, "batch_length": 16, "device": "c
 FULL = Plan(
     folder=FOLDER,
     tasks=[f"wpt/dmc-{n}-v0" for n in DMC] + [f"wpt/metaworld-{n}-v0" for n in METAWORLD],
-    behaviour="scripted",  # noise where there is no script
+    behaviour="scripted",  # noise for tasks without a script
     episodes=20,
     held_out=8,
     windows=3,
@@ -77,7 +77,7 @@ def rows(
 ) -> Iterator[dict[str, Any]]:
     """Yield a row for each robot and way of predicting; draw `prediction.png` and `strips.png`.
 
-    :param updates: of each world model, if not the plan's; more of them continue from fewer
+    :param updates: of each world model, instead of the plan's; existing models are trained further
     :param probe: yield instead how well linear probes read the true state from the latents of the
         generalist and of each robot's specialist
     """
@@ -106,7 +106,7 @@ def rows(
 
 
 def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]]:
-    """Yield the probes of an untrained model, of the generalist and of the robot's specialist."""
+    """Yield the probes of an untrained model, the generalist and the robot's specialist."""
     untrained = WPT("WPTPolicy", seed=0, **plan.model)
     generalist = train(plan, "generalist", dataset, plan.updates)
     for task in plan.tasks:
@@ -119,18 +119,18 @@ def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]
 
 
 def split(data: TrajectoryDataset, plan: Plan) -> tuple[TrajectoryDataset, TrajectoryDataset]:
-    """What is trained on, and each task's last episodes, which are not; they come task by task."""
+    """Return the training trajectories, and the last episodes of each task, which are held out."""
     late = np.arange(len(data)) % plan.episodes >= plan.episodes - plan.held_out
     return data.subset(np.flatnonzero(~late)), data.subset(np.flatnonzero(late))
 
 
 def of(dataset: TrajectoryDataset, *robots: str) -> TrajectoryDataset:
-    """The trajectories of these robots."""
+    """Return the trajectories of these robots."""
     return dataset.subset(np.flatnonzero([name in robots for name in dataset.embodiments]))
 
 
 def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Predict]]:
-    """By robot and name, what is compared; trains what is not trained yet."""
+    """Return the models to compare by robot and name; train those that do not exist."""
     robots = list(dict.fromkeys(str(robot) for robot in dataset.embodiments))
     budget, scratch = f"{plan.further} updates", f"scratch-{plan.further}"
     from_scratch = train(plan, scratch, of(dataset, LEFT_OUT), plan.further)
@@ -167,7 +167,7 @@ def train(
 ) -> WPT:
     """Train a world model up to `updates` updates, or continue from the model `start`.
 
-    :raises ValueError: it has had more already
+    :raises ValueError: if it has more updates already
     """
     file = plan.folder / name / "model.zip"
     if start is not None and not file.exists():
@@ -178,7 +178,7 @@ def train(
     )
     if model.pretrain_steps > updates:
         raise ValueError(
-            f"{file} has had {model.pretrain_steps} updates, not {updates}: give as many, or "
+            f"{file} has {model.pretrain_steps} updates, not {updates}: pass as many, or "
             f"delete {plan.folder}"
         )
     return model

@@ -1,4 +1,4 @@
-"""Where the time of a whole update goes, by operator."""
+"""The time of a whole update by operator."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ TOP = 15
 
 
 def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
-    """All operators of one update in a row, then the dearest; shares are of their own time."""
+    """Yield the total of all operators of one update, then the most expensive ones."""
     torch.set_num_threads(threads)
     size, batch, length = ("debug", 2, 8) if quick else ("small", 16, 64)
     model = agent(size, precision)

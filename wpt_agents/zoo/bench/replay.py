@@ -1,4 +1,4 @@
-"""A batch from memory, and the memory that the images take."""
+"""The time of a batch from memory, and the memory of the images."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -13,7 +13,7 @@ LENGTH, ACTIONS = 500, 6
 
 
 def rows(quick: bool = False) -> Iterator[dict]:
-    """One row a number of stored images: what they alone take, and what the process grew by."""
+    """Yield a row for each number of stored images: their size, and the growth of the process."""
     for frames in (2_000,) if quick else (100_000, 10_000):
         before = memory_mib("VmRSS")
         replay = filled(frames)
@@ -32,11 +32,11 @@ def rows(quick: bool = False) -> Iterator[dict]:
             "held_mb": grown,
             "rss_mb": memory_mib("VmRSS"),
         }
-        del replay, sample  # or the next case would begin with its memory
+        del replay, sample  # otherwise the next case would start with its memory
 
 
 def filled(frames: int) -> ReplayBuffer:
-    """Episodes of 500 steps, as many as make `frames` images."""
+    """Return episodes of 500 steps with `frames` images in total."""
     rng, replay = np.random.default_rng(0), ReplayBuffer()
     for _ in range(frames // (LENGTH + 1)):
         replay.add(

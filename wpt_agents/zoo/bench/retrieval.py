@@ -1,4 +1,4 @@
-"""What retrieval finds in a mixed store, and what the index costs at the paper's size.
+"""The accuracy of retrieval in a mixed dataset, and the cost of the index at the paper's size.
 
 Queries are the first images of fresh episodes, as in fine-tuning; the search knows neither the
 robot's name nor its action width. Data and model are kept in `runs/bench/retrieval`.
@@ -33,24 +33,24 @@ EPISODES, STEPS, NEAREST, QUERIES = 20, 2000, 10, 10
 MODEL: dict[str, Any] = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
 PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
 
-# A suite, the column of its share, and the column of what a random choice would have.
+# A suite, the column of its share, and the column of the share for a random choice.
 COLUMNS = (
     ("dmc", "own robot, DMControl", "by chance"),
-    ("metaworld", "own task, Meta-World", "by chance "),  # a name of its own: columns are keys
+    ("metaworld", "own task, Meta-World", "by chance "),  # a unique key
 )
 
 Embed = Callable[[np.ndarray], np.ndarray]  # (n, 64, 64, 3) uint8 -> (n, E) float32
 
 
 class Queries(NamedTuple):
-    """First images of fresh episodes."""
+    """The first images of new episodes."""
 
     image: np.ndarray  # (N, 64, 64, 3) uint8
     task: list[str]
 
 
 def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
-    """The share of the nearest that are of the query's own kind, then time and memory."""
+    """Yield the share of nearest neighbours of the query's own kind, then time and memory."""
     if quick:
         yield index_cost(2_000, 64)
         return
@@ -76,7 +76,7 @@ def pixels(image: np.ndarray) -> np.ndarray:
 
 
 def fresh_queries(tasks: list[str], number: int) -> Queries:
-    """The first images of `number` episodes of each task, of seeds that collecting does not use."""
+    """Return first images of `number` episodes of each task, with seeds not used for collecting."""
     images = []
     for task in tasks:
         with closing(gym.make(task, **LOOK)) as env:
@@ -85,7 +85,7 @@ def fresh_queries(tasks: list[str], number: int) -> Queries:
 
 
 def shares(dataset: TrajectoryDataset, embed: Embed, asked: Queries, k: int) -> dict[str, Any]:
-    """How many of the k nearest are of the query's own robot (DMControl) or task (Meta-World)."""
+    """Return the share of the k nearest of the right robot (DMControl) or task (Meta-World)."""
     retriever = Retriever.build(dataset, embed, "bench")
     robots, tasks = np.array(dataset.embodiments), np.array(dataset.tasks)
     hits: dict[str, list[float]] = {suite: [] for suite, *_ in COLUMNS}
@@ -106,7 +106,7 @@ def _mean(values: list[float]) -> float | None:
 
 
 class _Blank:
-    """As much of a dataset as the index looks at: black first images."""
+    """The part of a dataset that the index uses: black first images."""
 
     def __init__(self, length: int) -> None:
         self.length, self.embodiments, self.fingerprint = length, [None] * length, "blank"
@@ -121,7 +121,7 @@ class _Blank:
 
 
 def index_cost(trajectories: int, width: int) -> dict[str, Any]:
-    """Seconds and peak memory of building and searching, in a process of its own."""
+    """Measure time and peak memory of building and searching, in a new process."""
     with worker_pool(1) as pool:
         return pool.submit(_index_cost, trajectories, width).result()
 

@@ -1,4 +1,4 @@
-"""How the cost of a unit of work grows with size, batch, length and the number of environments."""
+"""The cost of a unit of work by size, batch, length and number of environments."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +10,7 @@ import torch
 from wpt_agents.zoo.bench import policy
 from wpt_agents.zoo.bench.model import updates
 
-GRID = {  # what grows: cases of (size, batch, length)
+GRID = {  # axis: cases of (size, batch, length)
     "batch": [("tiny", batch, 16) for batch in (4, 8, 16, 32)],
     "length": [("tiny", 16, length) for length in (8, 16, 32, 64)],
     "size": [(size, 16, 16) for size in ("debug", "tiny", "small", "medium")],
@@ -20,7 +20,7 @@ UNITS = {"batch": "image", "length": "image", "size": "GFLOP", "environments": "
 
 
 def rows(quick: bool = False, threads: int = 1, precision: str = "fp32") -> Iterator[dict]:
-    """A row a case: `grows` says along which axis, `ms_per_unit` what a unit of work costs."""
+    """Yield a row for each case: `grows` is the axis, `ms_per_unit` the cost of a unit of work."""
     torch.set_num_threads(threads)
     for row in policy.rows(quick, threads):
         measured = SimpleNamespace(**row)
@@ -43,7 +43,7 @@ def _per_unit(row: dict[str, Any], grows: str, units: float) -> dict[str, Any]:
 
 
 def plot(measured: list[dict[str, Any]], path: Path) -> None:
-    """A picture of `rows`: a panel an axis, a line for each kind of step; flat is proportional."""
+    """Plot `rows`: a panel per axis, a line per kind of step; a flat line is proportional cost."""
     from matplotlib.figure import Figure
 
     axes = [name for name in UNITS if _lines(measured, name)]
@@ -61,7 +61,7 @@ def plot(measured: list[dict[str, Any]], path: Path) -> None:
 
 
 def _lines(measured: list[dict[str, Any]], name: str) -> dict[str, list[tuple[float, float]]]:
-    """The points of each line of a panel, from left to right."""
+    """Return the points of each line of a panel, from left to right."""
     key = {"size": "gflop", "length": "length"}.get(name, "batch")
     lines: dict[str, list[tuple[float, float]]] = {}
     for row in measured:

@@ -1,7 +1,7 @@
-"""Updates a second with one thread and with several, alone and beside another busy process.
+"""Updates per second with one and several threads, with and without other busy processes.
 
-Threads of OpenMP wait for each other by spinning, which takes a core from whoever has work to do.
-Its wait policy is read when torch is loaded, so each case is measured in a process of its own.
+OpenMP threads wait for each other by spinning, which takes a core from other processes. The wait
+policy is read when torch is loaded, so each case is measured in a new process.
 """
 
 import os
@@ -53,7 +53,7 @@ def available_cores() -> int:
 
 @contextmanager
 def busy(processes: int) -> Iterator[None]:
-    """Keep a number of cores busy with processes that compute without end."""
+    """Keep a number of cores busy with processes in an endless loop."""
     with ExitStack() as stack:
         for _ in range(processes):
             process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
@@ -65,7 +65,7 @@ def busy(processes: int) -> Iterator[None]:
 def measured(
     threads: int, policy: str, size: str, batch: int, length: int, seconds: float
 ) -> float:
-    """Return the updates a second of a new process with these threads and this wait policy."""
+    """Return the updates per second of a new process with these threads and this wait policy."""
     environment = {name: value for name, value in os.environ.items() if name != POLICY}
     environment["OMP_NUM_THREADS"] = str(threads)
     if policy != "default":

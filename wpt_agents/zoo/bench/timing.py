@@ -1,4 +1,4 @@
-"""Medians after a warm-up, counted work, and the ceiling of a large matmul beside them."""
+"""Median times after a warm-up, counted work, and the speed of a large matmul as a ceiling."""
 
 import ctypes
 import gc
@@ -16,14 +16,14 @@ from torch.utils.flop_counter import FlopCounterMode
 from wpt_agents.fast.products import product_by_convolution
 from wpt_agents.model.ops import definitions
 
-SIDE = 1024  # of the matrices whose product is the ceiling
-MATMULS = 5  # in a row, so that a turn of them takes about a tenth of a second
+SIDE = 1024  # side of the matrices whose product is the ceiling
+MATMULS = 5  # per turn, which then takes about a tenth of a second
 
 
 def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple[float, float]:
-    """The medians of `step`'s processor time (this process, all threads) and of its wall-clock.
+    """Return the median CPU time (this process, all threads) and wall-clock time of `step`.
 
-    :param warmup: calls that are not counted: memory is fetched and caches fill
+    :param warmup: calls before the measurement, which allocate memory and fill caches
     """
     return seconds_in_turn([step], repetitions, warmup)[0]
 
@@ -31,7 +31,7 @@ def seconds(step: Callable[[], Any], repetitions: int, warmup: int = 1) -> tuple
 def seconds_in_turn(
     steps: Sequence[Callable[[], Any]], repetitions: int, warmup: int = 1
 ) -> list[tuple[float, float]]:
-    """`seconds` of several steps that take turns: what else the machine does befalls all alike."""
+    """`seconds` of several alternating steps, so that other load affects all of them equally."""
     times: list[list[tuple[float, float]]] = [[] for _ in steps]
     for _ in range(warmup + repetitions):
         for step, timings in zip(steps, times, strict=True):
@@ -44,9 +44,9 @@ def seconds_in_turn(
 
 
 def cost(processor: float, wall: float) -> float:
-    """Which of the two counts: processor time of one thread, as other processes disturb it less.
+    """Return the time that counts: CPU time for one thread, which other processes affect less.
 
-    Where several threads or a GPU take part, their speed is a matter of wall-clock.
+    With several threads or a GPU it is the wall-clock time.
     """
     return processor if torch.get_num_threads() == 1 and not torch.cuda.is_available() else wall
 
@@ -57,33 +57,33 @@ def _wait() -> None:
 
 
 def matmul(device: str = "cpu") -> Callable[[], Any]:
-    """`MATMULS` products of two square matrices by torch: what is called the ceiling.
+    """`MATMULS` products of two square matrices by torch, which is the ceiling.
 
-    On AMD's CPUs with AVX-512 it is none: see `wpt_agents.fast.products`, and `onednn`.
+    On AMD CPUs with AVX-512 it is not the maximum: see `wpt_agents.fast.products` and `onednn`.
     """
     a, b = (torch.randn(SIDE, SIDE).to(device) for _ in range(2))
     return lambda: [a @ b for _ in range(MATMULS)]
 
 
 def onednn() -> Callable[[], Any]:
-    """The same products as convolutions, which are oneDNN's on a CPU."""
+    """The same products as convolutions, which oneDNN computes on a CPU."""
     a, b = (torch.randn(SIDE, SIDE) for _ in range(2))
     return lambda: [product_by_convolution(a, b) for _ in range(MATMULS)]
 
 
 def matmul_gflop() -> float:
-    """The work of `matmul`, and of `onednn`."""
+    """Return the work of `matmul` and of `onednn`."""
     return MATMULS * 2 * SIDE**3 / 1e9
 
 
 def gflop(step: Callable[[], Any]) -> float:
-    """The multiplications and additions of one call, forward and backward, in units of 1e9.
+    """Return the multiplications and additions of one call, forward and backward, in 1e9.
 
-    Operations are counted as they are defined, not as the convolutions and products that compute
-    them faster. What is neither a product of matrices nor a convolution counts nothing.
+    The original operations are counted, not their fast implementations. Only matrix products and
+    convolutions count.
     """
     counter = FlopCounterMode(display=False)
-    # its own walks through the modules, some of which mind
+    # its own tracking fails for some modules
     counter.mod_tracker = _Everything()  # type: ignore[assignment]
     with definitions(), counter:
         step()
@@ -91,13 +91,13 @@ def gflop(step: Callable[[], Any]) -> float:
 
 
 class _Everything(nullcontext):
-    """Count for the whole step only, not for each module."""
+    """Count only for the whole step, not for each module."""
 
     parents = ("Global",)
 
 
 def operators(step: Callable[[], Any]) -> list[tuple[str, int, float]]:
-    """Each operator of one call with its count and its share of the time, the dearest first."""
+    """Return the operators of one call with count and share of time, the most expensive first."""
     activities = [torch.profiler.ProfilerActivity.CPU]
     with torch.profiler.profile(activities=activities) as profile:
         step()
@@ -123,14 +123,14 @@ def peak_rss_mb() -> float:
 def forget_peak() -> None:
     """Reset `peak_rss_mb` to the memory in use now."""
     gc.collect()
-    with suppress(OSError, AttributeError, TypeError):  # where there is no glibc
-        ctypes.CDLL(None).malloc_trim(0)  # what was freed and kept goes back to the system
+    with suppress(OSError, AttributeError, TypeError):  # systems without glibc
+        ctypes.CDLL(None).malloc_trim(0)  # returns freed memory to the system
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def memory_mib(field: str) -> float:
-    """A figure of this process: VmRSS, resident now, or VmHWM, the most so far; Linux, else nan."""
+    """Return VmRSS (resident now) or VmHWM (peak) of this process; nan except on Linux."""
     status = Path("/proc/self/status")
     if not status.exists():
         return float("nan")

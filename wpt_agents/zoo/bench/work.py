@@ -1,4 +1,4 @@
-"""What an update asks of a machine, counted without a clock: for sizes too large for this one."""
+"""The work of an update, counted without measuring time, for sizes too large for this machine."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -9,7 +9,7 @@ from wpt_agents.model.ops import definitions
 from wpt_agents.zoo.bench.model import agent, count, synthetic_batch, whole_step, world_model_step
 from wpt_agents.zoo.bench.timing import gflop
 
-BATCH, LENGTH = 16, 64  # work is reported for this batch, counted on a smaller one and multiplied
+BATCH, LENGTH = 16, 64  # work is reported for this batch, scaled up from a smaller one
 COUNTED = 1, 4
 NO_LAUNCH = {  # operators that compute nothing
     *("view", "_unsafe_view", "t", "transpose", "permute", "as_strided", "expand", "slice"),
@@ -19,7 +19,7 @@ NO_LAUNCH = {  # operators that compute nothing
 
 
 def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
-    """TFLOP of a batch of 16 x 64 by size; the operators' calls do not depend on the size."""
+    """Yield the TFLOP of a 16 x 64 batch by size; the operator calls do not depend on the size."""
     calls = _calls(4 if quick else LENGTH)
     for size in ("debug",) if quick else ("tiny", "small", "medium", "paper"):
         model = agent(size)
@@ -42,7 +42,7 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def _calls(length: int) -> dict[str, int]:
-    """The operators' calls by the definitions, which is nearly the way that a GPU takes."""
+    """Return the operator calls without fast implementations, which is close to those on a GPU."""
     model, data = agent("debug"), synthetic_batch(1, length)
     with definitions():
         return {
@@ -52,7 +52,7 @@ def _calls(length: int) -> dict[str, int]:
 
 
 def launches(step: Callable[[], Any]) -> int:
-    """How many operators that compute something a call of `step` calls, forward and backward."""
+    """Return the number of computing operators in a call of `step`, forward and backward."""
     with _Calls() as counter:
         step()
     return counter.number

@@ -119,7 +119,7 @@ def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]
 
 
 def split(data: TrajectoryDataset, plan: Plan) -> tuple[TrajectoryDataset, TrajectoryDataset]:
-    """Return the training trajectories, and the last episodes of each task, which are held out."""
+    """Return the training trajectories, and the held-out last episodes of each task."""
     late = np.arange(len(data)) % plan.episodes >= plan.episodes - plan.held_out
     return data.subset(np.flatnonzero(~late)), data.subset(np.flatnonzero(late))
 

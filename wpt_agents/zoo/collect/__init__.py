@@ -1,4 +1,4 @@
-"""Playing tasks to collect non-curated data: behaviours, workers, the collection itself."""
+"""Collect non-curated data by playing tasks."""
 
 import warnings
 from typing import Any

@@ -1,4 +1,4 @@
-"""What collecting does: noise of several colours, uniform actions, Meta-World's noised scripts."""
+"""Behaviours for collecting data: coloured noise, uniform actions, scripts with noise."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 import wpt_envs
 
 COLOURS = ("white", "pink", "ou-4", "ou-16", "ou-64")  # ou-n: correlated over n steps
-AMPLITUDES = (0.3, 1.5)  # standard deviation, drawn once an episode, before clipping to [-1, 1]
+AMPLITUDES = (0.3, 1.5)  # standard deviation, drawn once per episode, before clipping to [-1, 1]
 
 Act = Callable[[np.ndarray, dict[str, Any], int], np.ndarray]
 """(obs, info, step) -> action (A,) in [-1, 1]."""
@@ -34,19 +34,19 @@ def coloured_noise(rng: np.random.Generator, colour: str, length: int, width: in
 
 
 def noise_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Act, str]:
-    """An episode's worth of noise of a random colour and amplitude, and its name."""
+    """Return the noise for an episode, of random colour and amplitude, and its name."""
     colour, amplitude = str(rng.choice(COLOURS)), rng.uniform(*AMPLITUDES)
     noise = np.clip(amplitude * coloured_noise(rng, colour, length, width), -1, 1)
     return lambda obs, info, step: noise[step], f"{colour} noise, amplitude {amplitude:.2f}"
 
 
 def random_actions(rng: np.random.Generator, width: int, length: int) -> tuple[Act, str]:
-    """Uniform actions, drawn at every step, and their name."""
+    """Return uniform actions, drawn at every step, and their name."""
     return lambda obs, info, step: rng.uniform(-1, 1, width), "uniform random actions"
 
 
 def scripted_actions(rng: np.random.Generator, task: str, sigma: float) -> tuple[Act, str]:
-    """Meta-World's own scripted policy with Gaussian noise, and its name."""
+    """Return Meta-World's scripted policy with Gaussian noise, and its name."""
     from metaworld.policies import ENV_POLICY_MAP  # loads a simulator
 
     policy = ENV_POLICY_MAP[f"{wpt_envs.TASKS[task].name}-v3"]()  # type: ignore[abstract]

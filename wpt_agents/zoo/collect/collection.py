@@ -1,4 +1,4 @@
-"""Non-curated data: trajectories of noise, noised policies or curiosity, without rewards.
+"""Collect reward-free trajectories of noise, noisy policies or curious agents.
 
 Example::
 
@@ -65,8 +65,8 @@ def collect(
     """Play episodes of each task and store them in a dataset, without rewards by default.
 
     The same arguments and seed give the same data with any number of workers, and after
-    interruptions. Several workers are new processes: call this from a script under
-    `if __name__ == "__main__":`.
+    interruptions. Several workers are separate processes, so call this from a script
+    under `if __name__ == "__main__":`.
 
     :param path: a folder; a finished collection is returned unchanged, an unfinished one continued
     :param tasks: ids for `gymnasium.make`
@@ -96,7 +96,7 @@ def collect(
     dataset, total = _open(Path(path), description), len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
-            f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
+            f"{path} has {dataset.appended} episodes, more than the {total} of this collection: "
             "two processes have collected into it at once; delete it and collect again"
         )
     if dataset.appended == total:
@@ -107,7 +107,7 @@ def collect(
     if behaviour == STATE_CURIOSITY:
         gather = _collect_state_curious
     with dataset:
-        dataset.reserve()  # before what is missing is counted
+        dataset.reserve()  # before counting the missing episodes
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
             gather(dataset, tasks, episodes, recipe, workers, bar)
     return TrajectoryDataset.open(path)
@@ -121,7 +121,7 @@ def _collect_state_curious(
     workers: int,
     bar: "tqdm[None]",
 ) -> None:
-    """Explore each task by its state, then record the stages of the exploration as pixels."""
+    """Explore each task by its state, then record images of the exploration's stages."""
     left = [t for at, t in enumerate(tasks) if _done(dataset, at, episodes) < episodes]
     write = partial(
         write_stages, dataset.path, env=recipe.env, seed=recipe.seed, settings=recipe.settings
@@ -163,7 +163,7 @@ def _collect_curious(
     workers: int,
     bar: "tqdm[None]",
 ) -> None:
-    """Each task's agent plays in a folder beside the data, which is taken in when it is done."""
+    """Let one agent per task collect into a separate folder, then add its data to the dataset."""
     trips = [
         Expedition(
             task,
@@ -193,7 +193,7 @@ def _collect_curious(
 
 
 def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
-    """How many episodes of the task number `at` the dataset holds: they come task by task."""
+    """Return the number of stored episodes of task number `at`; they are stored task by task."""
     return min(max(dataset.appended - at * episodes, 0), episodes)
 
 
@@ -212,7 +212,7 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
             "policy=FILE (--policy FILE) is for the behaviour 'policy', which needs it."
         )
     if policy is not None:
-        load_policy(policy)  # says what is wrong with it
+        load_policy(policy)  # raises an error if the policy is invalid
 
 
 def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
@@ -227,7 +227,7 @@ def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
 
 
 def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
-    """The dataset to append to: a new one, or the one that the same call began."""
+    """Return the dataset to append to: a new one, or the unfinished one of the same call."""
     label = path / "collect.json"
     dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
@@ -255,7 +255,7 @@ def _read_label(file: Path) -> dict[str, Any]:
 def _in_order(
     function: Callable[[Work], Result], jobs: Sequence[Work], workers: int
 ) -> Iterator[Result]:
-    """Yield the results in the jobs' order, at most two per worker ahead of the reader."""
+    """Yield results in the jobs' order, at most two per worker ahead of the consumer."""
     if workers < 2 or len(jobs) < 2:
         yield from map(function, jobs)
         return

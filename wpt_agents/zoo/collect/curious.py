@@ -1,7 +1,7 @@
-"""Collecting by curiosity: one agent a task, which learns from what it has played so far.
+"""Collect data with curious agents: one agent per task, which learns from its own episodes.
 
-An agent works in a folder of its own, with a dataset and a model file that is written after every
-episode; from the two it goes on as if it had never stopped.
+Each agent has its own folder, with a dataset and a model file that is written after every episode.
+They are sufficient to resume exactly.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -23,10 +23,10 @@ from wpt_agents.zoo.collect.workers import worker_pool
 
 @dataclass(frozen=True)
 class Expedition:
-    """All episodes of one task, all that a worker needs to know of them.
+    """All episodes of one task, with everything that a worker needs.
 
-    :param folder: where the agent works
-    :param settings: keywords of WPT beside `EXPLORE`
+    :param folder: the agent's folder
+    :param settings: keywords of WPT in addition to `EXPLORE`
     """
 
     task: str
@@ -42,7 +42,7 @@ class Expedition:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sums in one order, whatever the machine: the data shall depend on the seed alone."""
+    """Use one thread, so that sums have a fixed order and data depend only on the seed."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -52,7 +52,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def explore(trip: Expedition) -> Iterator[int]:
-    """Plays what is missing of an expedition; yields each episode's number when it is stored."""
+    """Play the missing episodes of an expedition; yield each episode's number once stored."""
     trip.folder.mkdir(parents=True, exist_ok=True)
     store = TrajectoryDataset.open_or_create(trip.folder / "data")
     if len(store) == trip.episodes:
@@ -60,14 +60,14 @@ def explore(trip: Expedition) -> Iterator[int]:
     with _one_thread(), store, closing(trip.make()) as env:
         model = _explorer(trip, env, store)
         for trajectory in model.explore(trip.episodes):
-            if len(store) < model.episodes:  # else it was stored before the model was
+            if len(store) < model.episodes:  # otherwise it was stored before the model
                 store.append(_labelled(trajectory, trip, model.episodes))
             model.save(trip.folder / "explorer.zip")
             yield model.episodes
 
 
 def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explorer:
-    """A new agent, or the one that played what is stored."""
+    """Return a new agent, or the one that played the stored episodes."""
     kind, file = EXPLORERS[trip.behaviour], trip.folder / "explorer.zip"
     if not file.exists():
         assert env.action_space.shape is not None
@@ -75,7 +75,7 @@ def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explo
         return kind("WPTPolicy", env, seed=trip.seed, **keywords)
     model = kind.load(file, env=env)
     for trajectory in store.subset(range(model.episodes)):
-        # Nothing learns from the task's rewards, but that they are known marks the task's episodes.
+        # The agent does not learn from the rewards, but known rewards mark the task's episodes.
         reward = trajectory.reward if trip.rewards else np.zeros(len(trajectory), np.float32)
         model.replay_buffer.add(replace(trajectory, reward=reward))
     return model
@@ -99,9 +99,9 @@ def _explore_all(trip: Expedition) -> None:
 def explore_each(
     trips: list[Expedition], workers: int, moved: Callable[[int], Any]
 ) -> Iterator[TrajectoryDataset]:
-    """The datasets of the expeditions in their order.
+    """Run the expeditions, and return their datasets in order.
 
-    :param moved: called now and then with how many episodes of all are stored
+    :param moved: called regularly with the number of stored episodes
     """
     if workers < 2 or len(trips) < 2:
         for trip in trips:

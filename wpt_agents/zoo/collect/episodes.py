@@ -1,4 +1,4 @@
-"""Playing the episodes of a collection: each one is a function of its task, recipe and number."""
+"""Play the episodes of a collection; each depends only on its task, recipe and number."""
 
 import json
 import warnings
@@ -20,14 +20,14 @@ from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 from wpt_agents.zoo.collect.state_curiosity import STAGES, by_state, stage_files, state_policy
 
 STATE_CURIOSITY = "explore-state"  # the behaviour of `state_curiosity`
-SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # Gaussian noise on the scripts' actions, in turn by episode
+SIGMAS = (0.1, 0.3, 0.5, 1.0, 2.0)  # of the noise on scripted actions, used in turn
 
 
-MAX_STEPS = 1000  # where an environment without a time limit is cut
+MAX_STEPS = 1000  # limit for environments without a time limit
 
 
 def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
-    """Plays one episode, cut after `max_steps`, and returns it with its rewards."""
+    """Play one episode of at most `max_steps`, and return it with its rewards."""
     obs, info = env.reset(seed=seed)
     images, actions, rewards = [obs], list[np.ndarray](), list[float]()
     terminated = truncated = False
@@ -44,15 +44,15 @@ def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Tra
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the episodes of a collection come about, apart from the task.
+    """The settings by which the episodes of a collection are played, apart from the task.
 
     :param behaviour: one of `BEHAVIOURS`
     :param env: keyword arguments of `gymnasium.make`
     :param rewards: whether to keep the rewards
-    :param sigmas: Gaussian noise on scripted and saved policies, in turn by episode
+    :param sigmas: standard deviations of the noise on scripted and saved policies, used in turn
     :param policy: a saved policy, see `wpt_agents.zoo.collect.policies.load_policy`
-    :param settings: keywords of WPT for a curious agent, beside `EXPLORE`
-    :param stages: the folder with the stages of an exploration by state, played in turn by episode
+    :param settings: keywords of WPT for a curious agent, in addition to `EXPLORE`
+    :param stages: the folder with the stages of an exploration by state, which are played in turn
     """
 
     seed: int = 0
@@ -65,19 +65,19 @@ class Recipe:
     stages: str | None = None
 
     def label(self) -> dict[str, Any]:
-        """What `collect.json` says: seed, behaviour and env, and what is not as by default."""
+        """Return the content of `collect.json`: seed, behaviour, env, and non-default settings."""
         always, default = ("seed", "behaviour", "env"), vars(Recipe())
         changed = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
         return json.loads(json.dumps(changed))
 
     def sigma(self, episode: int) -> float:
-        """The noise of an episode."""
+        """Return the noise of an episode."""
         return self.sigmas[episode % len(self.sigmas)]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Consecutive episodes of one task, all that a worker needs to know of them."""
+    """Consecutive episodes of one task, with everything that a worker needs."""
 
     task: str
     first: int
@@ -86,14 +86,14 @@ class Job:
 
 
 def play(job: Job) -> list[Trajectory]:
-    """Play the episodes of a job; they depend on the job alone."""
+    """Play the episodes of a job, which depend only on the job."""
     with closing(make_env(job.task, job.recipe)) as env:
         episodes = range(job.first, job.first + job.count)
         return [play_episode(env, job, episode) for episode in episodes]
 
 
 def make_env(task: str, recipe: Recipe) -> gym.Env:
-    """The task with actions in [-1, 1], telling its state to those who need it."""
+    """Make the task with actions in [-1, 1], and with the state in `info` if it is needed."""
     needs_state = recipe.behaviour == "scripted" and has_script(task)
     needs_state = needs_state or (recipe.policy is not None and sees_states(recipe.policy))
     needs_state = needs_state or recipe.stages is not None
@@ -104,15 +104,15 @@ def make_env(task: str, recipe: Recipe) -> gym.Env:
 
 
 def play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:
-    """Play the episode of this number; it depends on job and number alone."""
+    """Play the episode of this number, which depends only on job and number."""
     recipe = job.recipe
-    task = zlib.crc32(job.task.encode())  # by name: the list of tasks may grow
+    task = zlib.crc32(job.task.encode())  # by name, because tasks may be added
     source = np.random.SeedSequence([recipe.seed, task, episode])
     assert env.action_space.shape is not None
     act, name = _actions(
         np.random.default_rng(source), job.task, recipe, episode, env.action_space.shape[0]
     )
-    with warnings.catch_warnings():  # some of Meta-World's scripts ask for more than they can have
+    with warnings.catch_warnings():  # some of Meta-World's scripts exceed the action limits
         warnings.filterwarnings("ignore", "Constant\\(s\\) may be too high")
         played = record(env, act, int(source.generate_state(1)[0]))
     reward = played.reward if recipe.rewards else None

@@ -1,4 +1,4 @@
-"""Saved policies as behaviours: a WPT model or one of Stable-Baselines3, with noise."""
+"""Saved policies as behaviours: models of WPT or Stable-Baselines3, with noise."""
 
 from functools import cache
 from pathlib import Path
@@ -19,29 +19,29 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 
 @cache
 def load_policy(name: str) -> BaseAlgorithm:
-    """The model in the file `name`: WPT's, or another algorithm's as `sac:expert.zip`.
+    """Load the model in the file `name`: of WPT, or of another algorithm as `sac:expert.zip`.
 
-    SB3's files hold pickles: load those that you trust.
+    SB3's files contain pickles: load only those that you trust.
 
-    :raises ValueError: an unknown algorithm, or a file that is not there
+    :raises ValueError: if the algorithm is unknown or the file is missing
     """
     algorithm, _, path = name.rpartition(":")
     if (algorithm or "wpt") not in ALGORITHMS:
         raise unknown_name("algorithm", algorithm, ALGORITHMS)
     if not Path(path).is_file():
-        raise ValueError(f"No policy {path}: give a model file, or `sac:FILE` for one of SB3's")
+        raise ValueError(f"No policy {path}: pass a model file, or `sac:FILE` for one of SB3's")
     return ALGORITHMS[algorithm or "wpt"].load(path, device="cpu")
 
 
 def sees_states(name: str) -> bool:
-    """Whether the policy takes `info["state"]` and not the image."""
+    """Return whether the policy observes `info["state"]` instead of the image."""
     return len(load_policy(name).observation_space.shape or ()) == 1
 
 
 class SavedPolicy:
-    """One episode's actions in [-1, 1]: the deterministic policy's, with Gaussian noise.
+    """The deterministic policy's actions in [-1, 1] for one episode, with Gaussian noise.
 
-    :param width: of the task's actions
+    :param width: number of the task's actions
     """
 
     def __init__(self, rng: np.random.Generator, name: str, sigma: float, width: int) -> None:
@@ -50,7 +50,7 @@ class SavedPolicy:
         self.state: tuple[np.ndarray, ...] | None = None
         if self.model.action_space.shape != (width,):
             raise ValueError(
-                f"{name} acts in {self.model.action_space}, the task takes {width} actions; give a "
+                f"{name} acts in {self.model.action_space}, the task has {width} actions; pass a "
                 "policy of this robot"
             )
 

@@ -1,9 +1,9 @@
-"""Curiosity on the simulator's state: behaviour for pixel datasets at minutes of CPU time.
+"""Curiosity on the simulator's state: data for image datasets within minutes of CPU time.
 
 Soft actor-critic (Stable-Baselines3's) seeks states that random network distillation
-(https://arxiv.org/abs/1810.12894) finds novel. It sees the simulator's state and no picture, which
-makes 100,000 steps a matter of minutes, and never the reward of a task. The policies of five stages
-of its training are then played and recorded as pixels, early and clumsy ones among them.
+(https://arxiv.org/abs/1810.12894) finds novel. It observes the simulator's state, not images, so
+100,000 steps take minutes, and it does not use the task's reward. The policies of five stages of
+its training, including early ones, are then played and recorded as images.
 
 Example::
 
@@ -31,18 +31,18 @@ from torch import Tensor, nn
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.collect.behaviours import Act
 
-STEPS = 100_000  # calls of `env.step` that an exploration lasts
-STAGES = 5  # policies that are kept of it, at equal distances
-WIDTH = 256  # of the networks of novelty
-CODES = 64  # outputs of the random network, which the predictor learns to foresee
-CLIP = 5.0  # standard deviations at which a normalised state is cut
+STEPS = 100_000  # calls of `env.step` in an exploration
+STAGES = 5  # number of policies to keep, evenly spaced
+WIDTH = 256  # width of the novelty networks
+CODES = 64  # outputs of the random network, which the predictor learns to predict
+CLIP = 5.0  # normalised states are clipped at this number of standard deviations
 
 StatePolicy = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """(state (S,), rng) -> action (A,) in [-1, 1], sampled."""
 
 
 class StateTask(gym.Wrapper):
-    """A task seen by its simulator's state, with actions repeated and no picture rendered.
+    """A task that returns its simulator's state, with repeated actions and without rendering.
 
     :param env: a task of `wpt_envs`, wrapped as `gymnasium.make` returns it
     :param repeat: control steps in a step
@@ -70,7 +70,7 @@ class StateTask(gym.Wrapper):
 
 
 class Novelty(nn.Module):
-    """Random network distillation: how badly a random network's output is foreseen in a state.
+    """Random network distillation: the error of predicting a random network's output.
 
     :param states: width of a state
     """
@@ -126,7 +126,7 @@ def _network(states: int) -> nn.Sequential:
 
 
 class NovelReplay(ReplayBuffer):
-    """Replay whose rewards are the novelty that the next states have when they are replayed."""
+    """A replay buffer whose rewards are the current novelty of the sampled next states."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -152,8 +152,8 @@ def explore_states(
     :param task: an id for `gymnasium.make`, of the suites dmc, metaworld or robotics
     :param env: keyword arguments of `gymnasium.make`
     :param steps: calls of `env.step` in all
-    :param seed: of everything that is drawn
-    :param stages: policies to keep, after equal shares of the steps
+    :param seed: seed of all random numbers
+    :param stages: number of policies to keep, evenly spaced over the steps
     :return: the policies' weights, oldest first, for `state_policy`
     """
     keywords = dict(env or {})
@@ -181,7 +181,7 @@ def explore_states(
 
 
 def stage_files(folder: Path, task: str) -> list[Path]:
-    """Return where the stages of a task's exploration are kept."""
+    """Return the folder of the stages of a task's exploration."""
     name = f"exploring-{zlib.crc32(task.encode()):08x}"
     return [folder / name / f"stage-{stage}.pt" for stage in range(STAGES)]
 
@@ -189,13 +189,13 @@ def stage_files(folder: Path, task: str) -> list[Path]:
 def write_stages(
     folder: Path, task: str, env: Mapping[str, Any], seed: int, settings: Mapping[str, Any]
 ) -> None:
-    """Explore a task and keep the stages in files, unless they are there."""
+    """Explore a task and save the stages, unless they exist already."""
     files = stage_files(folder, task)
     if files[-1].exists():  # written last
         return
     files[0].parent.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums in one order, so that the data depend on the seed alone
+    torch.set_num_threads(1)  # sums in a fixed order, so that the data depend only on the seed
     try:
         stages = explore_states(task, env, seed=seed, **settings)
     finally:
@@ -206,7 +206,7 @@ def write_stages(
 
 
 def by_state(policy: StatePolicy, rng: np.random.Generator) -> Act:
-    """Return a policy that sees the simulator's state as what plays an episode."""
+    """Convert a policy on the simulator's state into one that plays an episode."""
     return lambda obs, info, step: policy(info["state"], rng)
 
 

@@ -1,4 +1,4 @@
-"""Worker processes that end with the process that began them."""
+"""Worker processes that end with their parent process."""
 
 import os
 import threading
@@ -7,16 +7,16 @@ from multiprocessing import get_context, parent_process
 
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
-    """Fresh processes, so that none inherits another's state."""
+    """Return a context for new processes, which do not inherit any state."""
     return ProcessPoolExecutor(
         workers, mp_context=get_context("spawn"), initializer=end_with_parent
     )
 
 
 def end_with_parent() -> None:
-    """Ends this process as soon as its parent is gone, even if that was killed.
+    """End this process as soon as its parent has ended, even if the parent was killed.
 
-    Else it would go on, and its locks would keep the same command from being started again.
+    Otherwise it would continue, and its locks would block a restart of the command.
     """
     parent = parent_process()
     assert parent is not None

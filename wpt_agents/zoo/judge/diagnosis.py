@@ -1,8 +1,8 @@
-"""Compare the rewards and values that a model predicts with those that it then earns.
+"""Compare the rewards and values that a model predicts with the actual ones.
 
-If the imagined reward of the actor's own actions is far above the earned one, the actor exploits
-errors of the model. If that of the actions that were taken is, too, the dynamics are wrong. If only
-the critic's value is too high, the critic is wrong.
+If the imagined reward of the actor's actions is far above the actual reward, the actor exploits
+errors of the model. If the imagined reward of the executed actions is also too high, the dynamics
+are wrong. If only the critic's value is too high, the critic is wrong.
 """
 
 from collections.abc import Sequence
@@ -25,17 +25,17 @@ from wpt_agents.zoo.judge.evaluation import acting
 from wpt_agents.zoo.judge.trained import Trained
 from wpt_agents.zoo.terminal import console
 
-SAMPLES = 16  # dreams from each state
+SAMPLES = 16  # imagined trajectories from each state
 STARTS = 5  # states of an episode, evenly spaced
 
 
 @dataclass(frozen=True)
 class Promise:
-    """Predicted and earned rewards from one state of an episode on.
+    """Predicted and actual rewards from one state of an episode.
 
     :param start: the step of the state; a mean if episodes differ in length
-    :param earned: the reward per step that was earned over the horizon
-    :param same_actions: the reward per step that the model predicts for the actions that were taken
+    :param earned: the actual reward per step over the horizon
+    :param same_actions: the reward per step that the model predicts for the executed actions
     :param own_actions: the reward per step that it predicts for the actor's actions
     :param value: the critic's value of the state
     :param discounted: the return that `value` estimates, Eq. (2) to the end of the episode: the
@@ -54,7 +54,7 @@ class Promise:
 def promises(
     policy: WPTPolicy, trajectory: Trajectory, gamma: float, starts: Sequence[int], horizon: int
 ) -> list[Promise]:
-    """Return predicted and earned rewards at some steps of an episode.
+    """Return predicted and actual rewards at some steps of an episode.
 
     :param trajectory: with rewards, its actions in [-1, 1]
     :param starts: steps, each at least `horizon` before the end
@@ -112,9 +112,9 @@ class Diagnosis:
 def diagnose(
     trained: Trained, episodes: int, seed: int, horizon: int, device: str = "auto"
 ) -> Diagnosis:
-    """Play episodes with a trained model and compare its predictions with what it earns.
+    """Play episodes with a trained model and compare its predictions with actual rewards.
 
-    :raises ValueError: an episode that is not longer than `horizon`
+    :raises ValueError: if an episode is not longer than `horizon`
     """
     model = trained.load(device=device)
     if not isinstance(model, WPT):

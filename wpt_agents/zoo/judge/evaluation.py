@@ -1,4 +1,4 @@
-"""How good a policy is: its returns over seeded episodes, and a film of one of them."""
+"""Evaluate a policy: its returns over seeded episodes, and a video of one of them."""
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -22,11 +22,11 @@ from wpt_agents.zoo.terminal import progress
 
 Wrap = Callable[[VecEnv], VecEnv]
 
-EPISODE = 2  # a purpose in a seed's derivation, beside `plan.runs.EVALUATION`
+EPISODE = 2  # distinguishes these seeds from those of `plan.runs.EVALUATION`
 
 
 class EpisodeSeeds(gym.Wrapper):
-    """Seeds each reset by the number of the episode, so that no episode depends on earlier ones.
+    """Seed each reset with the number of the episode, so that episodes are independent.
 
     A seed passed to `reset` is that of episode 0; the seeds of all others are derived from it.
     """
@@ -39,18 +39,18 @@ class EpisodeSeeds(gym.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin the next episode."""
+        """Start the next episode."""
         self.seed = self.seed if seed is None else seed
         return self.env.reset(seed=self.next_seed(), options=options)
 
     def next_seed(self) -> int:
-        """Return the seed of the next episode, and count that episode as begun."""
+        """Return the seed of the next episode, and count that episode as started."""
         drawn = np.random.SeedSequence([self.seed, EPISODE, self.episode]).generate_state(1)
         self.episode += 1
         return int(drawn[0] >> 1) if self.episode > 1 else self.seed
 
     def go_to_episode(self, number: int) -> None:
-        """Let the next reset begin episode `number`."""
+        """Make the next reset start episode `number`."""
         self.episode = number
 
 
@@ -64,15 +64,15 @@ def make_vec_env(
 ) -> VecEnv:
     """Make seeded copies of a task, each under SB3's Monitor.
 
-    :param monitor: the file of its episodes, which is continued if it exists
-    :param workers: whether to give each copy a process of its own
+    :param monitor: the Monitor file, which is continued if it exists
+    :param workers: whether to run each copy in its own process
     """
     new = monitor is None or not Path(monitor).exists()
     row = wpt_envs.TASKS.get(task)
     logged = ("is_success",) if row is not None and row.metric == "success" else ()
 
     def make() -> gym.Env:
-        import wpt_envs  # noqa: F401  # a worker process knows the ids from it
+        import wpt_envs  # noqa: F401  # registers the ids in worker processes
 
         made = EpisodeSeeds(gym.make(task, **env))
         return Monitor(made, monitor, info_keywords=logged, override_existing=new)
@@ -83,7 +83,7 @@ def make_vec_env(
 
 
 def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
-    """Return how many calls of `env.step` an episode of the task lasts, None if unknown."""
+    """Return the number of `env.step` calls in an episode of the task, None if unknown."""
     row = wpt_envs.TASKS.get(task)
     return row.frames // env.get("action_repeat", 2) if row else None
 
@@ -97,11 +97,11 @@ def evaluate(
     label: str = "",
     wrap: Wrap | None = None,
 ) -> Score:
-    """Play `episodes` episodes side by side, each with its own seed.
+    """Play `episodes` episodes in parallel, each with its own seed.
 
     Policies that are evaluated with the same `seed` start from the same initial states.
 
-    :param wrap: what the policy needs around its environments
+    :param wrap: the wrapper that the policy needs around its environments
     """
     successes: list[bool] = []
     venv = make_vec_env(task, env, seed, episodes)
@@ -124,7 +124,7 @@ def evaluate(
 
 
 def acting(policy: PolicyPredictor) -> Act:
-    """Return the policy as `record` plays it: it keeps the recurrent state within an episode."""
+    """Return a function for `record` that keeps the policy's recurrent state in an episode."""
     state: State | None = None
 
     def act(obs: np.ndarray, info: dict[str, Any], step: int) -> np.ndarray:
@@ -146,8 +146,8 @@ def film(
 ) -> tuple[Trajectory, list[np.ndarray], float]:
     """Play one episode and render it.
 
-    :param wrap: what the policy needs around its environment
-    :return: the episode, its frames at `size`, and the frame rate that makes it real time
+    :param wrap: the wrapper that the policy needs around its environment
+    :return: the episode, its frames at `size`, and the frame rate of real time
     """
     made = gym.make(task, render_mode="rgb_array", render_size=size, **env)
     filmed = Remembering(made)
@@ -167,7 +167,7 @@ def film(
             obs, reward, dones, (info,) = venv.step(actions[-1][None])
             rewards.append(reward[0])
             done = bool(dones[0])
-    images = filmed.images[:-1]  # without the image of the reset after the end
+    images = filmed.images[:-1]  # without the image of the automatic reset
     terminated = not info["TimeLimit.truncated"]
     trajectory = Trajectory(
         np.stack(images), np.stack(actions), np.array(rewards, np.float32), terminated
@@ -176,13 +176,13 @@ def film(
 
 
 class Remembering(gym.ObservationWrapper):
-    """Keeps every image that the environment shows, whatever is wrapped around it."""
+    """Record every image of the environment, regardless of outer wrappers."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.images: list[np.ndarray] = []
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """Keep the image and pass it on."""
+        """Record and return the image."""
         self.images.append(observation)
         return observation

@@ -1,6 +1,6 @@
-"""How far off open-loop predictions are, by horizon, on trajectories that were not trained on.
+"""Errors of open-loop predictions by horizon, on held-out trajectories.
 
-A few images are filtered, then the actions alone drive the model. The error is that of Eq. (1):
+A few images are filtered, then the model predicts from actions alone. The error is that of Eq. (1):
 squared, summed over an image whose values lie in [-0.5, 0.5].
 """
 
@@ -19,9 +19,9 @@ from wpt_agents.training.checks import check_images
 from wpt_agents.zoo.pictures.predictions import Curve, Strip, draw_curves, draw_strips
 from wpt_agents.zoo.statistics import bootstrap
 
-CONTEXT, HORIZON = 5, 40  # images filtered, then images predicted
+CONTEXT, HORIZON = 5, 40  # number of filtered images, then of predicted images
 HORIZONS_SHOWN = (1, 5, 10, 20, 40)  # steps ahead, columns of the table
-SHOWN = (0, 5, 10, 20, 40)  # horizons of the strips; 0 is the last image filtered
+SHOWN = (0, 5, 10, 20, 40)  # horizons of the strips; 0 is the last filtered image
 
 Predict = Callable[[Batch], np.ndarray]  # (B, T) windows -> (B, T, 64, 64, 3)
 Ways = Mapping[str, Mapping[str, Predict]]  # by robot and name
@@ -31,12 +31,12 @@ Tests = Mapping[str, Sequence[Batch]]  # by robot, the windows of each trajector
 def judge(
     model: WPT, dataset: TrajectoryDataset, episodes: int, folder: Path | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Compares a world model with copying the last frame and with the mean frame, robot by robot.
+    """Compare a world model with copying the last frame and with the mean frame, for each robot.
 
-    :param dataset: what the model was not trained on; its own mean frame is the one to beat
-    :param episodes: of each robot, at most; spread evenly over those that are long enough
-    :param folder: where to draw
-    :raises ValueError: no trajectory is long enough, or one has more actions than the model takes
+    :param dataset: held-out data, whose mean frame is one of the baselines
+    :param episodes: maximum number for each robot, evenly spaced over those that are long enough
+    :param folder: the folder of the pictures
+    :raises ValueError: if no trajectory is long enough, or has too many actions for the model
     """
     check_images(dataset)
     if (widest := max(dataset.action_dims)) > model.max_action_dim:
@@ -75,11 +75,11 @@ def compare(
     shown: Sequence[tuple[str, str, Sequence[str]]],
     left_out: str | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """A row for each robot and way of predicting.
+    """Yield a row for each robot and predictor.
 
-    :param folder: where `prediction.csv`, `prediction.png` and `strips.png` are written
-    :param shown: the strips: title, robot, and names of what predicts
-    :param left_out: a robot whose other ways have a panel of their own
+    :param folder: the folder for `prediction.csv`, `prediction.png` and `strips.png`
+    :param shown: the strips: title, robot, and names of predictors
+    :param left_out: a robot whose additional predictors have a separate panel
     """
     errors = {
         robot: {name: errors_by_horizon(predict, tests[robot]) for name, predict in by_name.items()}
@@ -105,14 +105,14 @@ def compare(
 
 
 def windows(trajectory: Trajectory, number: int, width: int) -> Batch:
-    """Windows of CONTEXT + HORIZON images, spread evenly from a trajectory's start to its end."""
+    """Return windows of CONTEXT + HORIZON images, evenly spaced over a trajectory."""
     length = CONTEXT + HORIZON
     starts = np.linspace(0, len(trajectory) + 1 - length, number).astype(int)
     return stack_windows([led_to(trajectory, s, s + length, width) for s in starts])
 
 
 def dream(model: WPT) -> Predict:
-    """The world model's open-loop prediction, by one sample of the latents."""
+    """Predict open-loop with the world model, with one sample of the latents."""
 
     def predict(batch: Batch) -> np.ndarray:
         generator = Generator(model.device).manual_seed(0)
@@ -123,14 +123,14 @@ def dream(model: WPT) -> Predict:
 
 
 def copy_last_frame(batch: Batch) -> np.ndarray:
-    """The images filtered, then the last of them again and again."""
+    """Return the filtered images, then repeat the last one."""
     image = batch.image.numpy().copy()
     image[:, CONTEXT:] = image[:, CONTEXT - 1 : CONTEXT]
     return image
 
 
 class MeanFrame:
-    """Predicts the mean of all images of a dataset, (64, 64, 3), whatever happens."""
+    """Always predict the mean of all images of a dataset, (64, 64, 3)."""
 
     def __init__(self, dataset: TrajectoryDataset) -> None:
         total = sum(trajectory.image.sum(0, np.float64) for trajectory in dataset)
@@ -142,29 +142,29 @@ class MeanFrame:
 
 
 def squared_error(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """As in Eq. (1): (..., 64, 64, 3) of 0 to 255 each -> (...), summed over an image."""
+    """Return the error of Eq. (1), summed over an image: (..., 64, 64, 3) of 0 to 255 -> (...)."""
     assert true.shape == predicted.shape, (true.shape, predicted.shape)
     difference = (predicted.astype(np.float32) - true) / 255
     return np.square(difference).sum((-3, -2, -1), np.float64)
 
 
 def errors_by_horizon(predict: Predict, tests: Sequence[Batch]) -> np.ndarray:
-    """(trajectories, 1 + HORIZON), the mean over each trajectory's windows.
+    """Return the mean over each trajectory's windows, (trajectories, 1 + HORIZON).
 
-    :param tests: a trajectory's windows in each
+    :param tests: the windows of each trajectory
     """
     by_window = [squared_error(batch.image.numpy(), predict(batch)) for batch in tests]
     return np.stack([errors[:, CONTEXT - 1 :].mean(0) for errors in by_window])
 
 
 def with_interval(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(trajectories, ...) -> the mean (...) and its 95 % interval, bootstrapped over the first."""
+    """(trajectories, ...) -> the mean (...) and its 95 % bootstrap interval over trajectories."""
     low, high = bootstrap(lambda strata: strata[0].mean(1), [errors], draws=2000)
     return errors.mean(0), low, high
 
 
 def row(robot: str, name: str, errors: np.ndarray, copied: np.ndarray) -> dict[str, Any]:
-    """Errors at a few horizons, then their mean over all and its difference from copying."""
+    """Return errors at some horizons, their mean over all, and its difference from copying."""
     means = errors[:, 1:].mean(1)
     mean, low, high = with_interval(means)
     less, least, most = with_interval(means - copied[:, 1:].mean(1))
@@ -181,19 +181,19 @@ def row(robot: str, name: str, errors: np.ndarray, copied: np.ndarray) -> dict[s
 
 
 def one_by_one(batch: Batch) -> Iterator[Batch]:
-    """(B, T) windows as B batches of (1, T)."""
+    """Split (B, T) windows into B batches of (1, T)."""
     for i in range(len(batch.image)):
         yield Batch(**{name: stream[i : i + 1] for name, stream in vars(batch).items()})
 
 
 def typical(parts: Sequence[Batch]) -> Batch:
-    """The window of median motion, by the error of copying the last frame up to the end."""
+    """Return the window of median motion, measured by the final error of copying the last frame."""
     moved = [squared_error(p.image.numpy(), copy_last_frame(p))[0, -1] for p in parts]
     return parts[int(np.argsort(moved)[len(moved) // 2])]
 
 
 def strip(title: str, tests: Sequence[Batch], ways: Mapping[str, Predict]) -> Strip:
-    """True and predicted images of a typical window."""
+    """Return true and predicted images of a typical window."""
     window = typical([part for batch in tests for part in one_by_one(batch)])
     at = [CONTEXT - 1 + h for h in SHOWN]
     images = {"true": window.image.numpy()} | {n: predict(window) for n, predict in ways.items()}
@@ -201,7 +201,7 @@ def strip(title: str, tests: Sequence[Batch], ways: Mapping[str, Predict]) -> St
 
 
 def write_curves(path: Path, curves: Sequence[Curve]) -> None:
-    """Writes every horizon's error and interval."""
+    """Write the error and interval of every horizon."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(("robot", "prediction", "horizon", "error", "low", "high"))

@@ -1,8 +1,8 @@
-"""Linear probes: how much of the simulator's state can be read off a world model's latents.
+"""Linear probes of the simulator's state from a world model's latents.
 
 A ridge regression from [h, z] to quantities such as a pole's angle or a drawer's position is fitted
-on some episodes and judged on others, by R²: 1 is perfect, 0 is no better than the mean. Episodes
-are those of scripted policies where there are any and of noise elsewhere.
+on some episodes and tested on others by R²: 1 is perfect, 0 is no better than the mean. Episodes
+are from scripted policies if there are any, else from noise.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.zoo.collect.episodes import Job, Recipe, has_script, make_env, play_episode
 
-PENALTY = 10.0  # of the ridge, on standardised features
+PENALTY = 10.0  # regularisation of the ridge, on standardised features
 Quantities = Mapping[str, Callable[[np.ndarray], np.ndarray]]  # (N, S) states -> (N,)
 
 
@@ -29,8 +29,8 @@ def entry(index: int) -> Callable[[np.ndarray], np.ndarray]:
     return lambda states: states[:, index]
 
 
-# What a task is about, by robot. The entries are those of dm_control's and Meta-World's own
-# observations. Meta-World's first object (entries 4 to 6) is the handle, the button, the hammer ...
+# The quantities of interest by robot: entries of dm_control's and Meta-World's own observations.
+# Meta-World's first object (entries 4 to 6) is the handle, the button, the hammer ...
 QUANTITIES: Mapping[str, Quantities] = {
     "cartpole": {"cart": entry(0), "pole cos": entry(1), "pole sin": entry(2)},
     "acrobot": {
@@ -59,27 +59,27 @@ class Watched:
 
 
 class KeepStates(gym.Wrapper):
-    """Keeps `info["state"]` of every observation of an episode."""
+    """Record `info["state"]` of every observation of an episode."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.states: list[np.ndarray] = []
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and forget the last one."""
+        """Start an episode, and clear the states of the last one."""
         obs, info = self.env.reset(**kwargs)
         self.states = [info["state"]]
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take a step and keep the state that it led to."""
+        """Take a step and record the next state."""
         result = self.env.step(action)
         self.states.append(result[-1]["state"])
         return result
 
 
 def watch(task: str, episodes: int, seed: int, rendering: str = "fast") -> Iterator[Watched]:
-    """Play episodes of a task and keep the states."""
+    """Play episodes of a task and record the states."""
     behaviour = "scripted" if has_script(task) else "noise"
     recipe = Recipe(seed, behaviour, {"rendering": rendering, "state_in_info": True})
     with closing(KeepStates(make_env(task, recipe))) as env:
@@ -128,11 +128,11 @@ def ridge_r2(
 def probe(
     model: WPT, tasks: Sequence[str], episodes: int = 10, seed: int = 1000
 ) -> Iterator[dict[str, Any]]:
-    """Yield how well a task's quantities can be read off the latents, a row for each.
+    """Yield a row for each quantity of a task, with the R² of predicting it from the latents.
 
     :param tasks: ids of `gymnasium.make`, of robots in `QUANTITIES`
-    :param episodes: half of them are fitted, half are judged
-    :param seed: of the episodes; collections for training use small seeds
+    :param episodes: half of them are for fitting, half for testing
+    :param seed: seed of the episodes; collections for training use small seeds
     """
     for task in tasks:
         robot = wpt_envs.TASKS[task].embodiment

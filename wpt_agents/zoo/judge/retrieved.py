@@ -1,4 +1,4 @@
-"""How many of the retrieved trajectories are of the task."""
+"""The share of retrieved trajectories that are of the right task."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -19,13 +19,13 @@ def own_task_shares(
     env: Mapping[str, Any],
     seed: int = 0,
 ) -> Iterator[tuple[str, list[float]]]:
-    """Yield each task's name and the share of what Eq. (5) retrieves for it that is of this task.
+    """Yield each task's name and its share of the trajectories that Eq. (5) retrieves for it.
 
-    :param model: has a dataset whose trajectories name their tasks
+    :param model: a model with a dataset whose trajectories name their tasks
     :param images: numbers of first images to search for (`retrieval_images`); one share for each
-    :param number: R, the trajectories that are retrieved
+    :param number: R, the number of trajectories to retrieve
     :param env: keyword arguments of `gymnasium.make`
-    :param seed: of the first episode; each of the next ones has a seed larger by 1
+    :param seed: seed of the first episode, which increases by 1 for each next one
     """
     assert model.dataset is not None
     of = np.array(model.dataset.tasks)

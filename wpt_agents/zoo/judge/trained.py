@@ -1,4 +1,4 @@
-"""A trained model: where it is, what it was trained on, how good it is, how it looks."""
+"""A trained model: find it with its task, evaluate it and film it."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -23,13 +23,13 @@ from wpt_agents.zoo.plan.presets import EnvSettings
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.tasks import find_tasks
 
-POLICIES = ("wpt", "prior")  # "wpt" is the agent, whichever method trained it
+POLICIES = ("wpt", "prior")  # "wpt" is the agent of any method
 FILMS = (".mp4", ".gif")
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A model file and the task that it acts on.
+    """A model file and its task.
 
     :param env: keyword arguments of `gymnasium.make`
     :param method: the method that trained it
@@ -43,7 +43,7 @@ class Trained:
     def load(self, policy: str = "wpt", device: str = "auto") -> PolicyPredictor:
         """Load the agent ("wpt"), or the prior actor that guided it ("prior"), without a dataset.
 
-        :raises ValueError: an unknown policy, or a model without a prior actor
+        :raises ValueError: if the policy is unknown or the model has no prior actor
         """
         return self.choose(self.load_agent(device), policy)
 
@@ -74,7 +74,7 @@ class Trained:
 
         :param path: an `.mp4`; or a `.gif`, which also shows what the agent's world model, if it
             has one, predicts of the whole episode from its first images and the actions
-        :raises ValueError: an unknown policy, a model without a prior actor, another ending
+        :raises ValueError: if the policy or the file type is unknown, or there is no prior actor
         """
         if path.suffix not in FILMS:
             raise ValueError(f"{path}: the name of a video must end in {' or '.join(FILMS)}")
@@ -115,7 +115,7 @@ def find_trained(path: Path, task: str = "") -> Trained:
 
 
 def best_model(folder: Path) -> Path:
-    """Return the model file that the run's score is of: the best agent if kept, else the last."""
+    """Return the model file of the run's score: the best agent if it was kept, else the last."""
     for name in ("best_model.zip", "model.zip"):
         if (folder / name).exists():
             return folder / name
@@ -124,7 +124,7 @@ def best_model(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Origin:
-    """What a run folder says of its model: task, environment and method."""
+    """Return the task, environment and method of the model in a run folder."""
 
     task: str
     env: Mapping[str, Any] = field(default_factory=dict)
@@ -132,7 +132,7 @@ class Origin:
 
 
 def read_origin(folder: Path) -> Origin | None:
-    """Read `config.yaml` of a run folder, None if there is none."""
+    """Read `config.yaml` of a run folder; return None if there is none."""
     path = folder / "config.yaml"
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""The policies that learn nothing: the zero action and uniformly random actions."""
+"""Untrained policies: the zero action, and uniformly random actions."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ State = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True)
 class DoNothing:
-    """The action zero."""
+    """A policy that always returns zeros."""
 
     action_space: spaces.Box
 
@@ -26,12 +26,12 @@ class DoNothing:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State | None]:
-        """Zeros, (n, A)."""
+        """Return zeros, (n, A)."""
         return np.zeros((len(observation), *self.action_space.shape), np.float32), None
 
 
 class RandomPolicy:
-    """Uniform in the action space."""
+    """A policy with uniform actions in the action space."""
 
     def __init__(self, action_space: spaces.Box, seed: int) -> None:
         self.action_space, self.rng = action_space, np.random.default_rng(seed)
@@ -43,7 +43,7 @@ class RandomPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State | None]:
-        """Uniform draws, (n, A), whatever `deterministic` says."""
+        """Return uniform actions, (n, A), regardless of `deterministic`."""
         low, high = self.action_space.low, self.action_space.high
         return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
 

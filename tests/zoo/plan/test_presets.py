@@ -315,6 +315,8 @@ def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_p
         ("wpt", ["collect.behaviour=policy"], "No collect.behaviour 'policy'"),
         ("kickstart", ["kickstart=5"], "--set kickstart=5 would have no effect"),
         ("scratch", ["guidance=linear(1,0,9)"], "--method scratch means guidance=0.0"),
+        ("scratch", ["plus.kickstart=5"], "--method scratch means kickstart=0.0"),
+        ("uds", ["rlpd.label=true"], "--method uds means label=zero"),
     ],
 )
 def test_what_a_run_would_stumble_over_or_overrule_is_refused_beforehand(

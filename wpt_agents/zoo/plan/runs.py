@@ -19,7 +19,7 @@ from wpt_agents.files.names import unknown_name
 from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
-from wpt_agents.zoo.plan.methods import Method, defaults, find_method
+from wpt_agents.zoo.plan.methods import Method, defaults, find_method, sections
 from wpt_agents.zoo.plan.presets import Preset, load_preset, wpt_keywords
 from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
@@ -250,13 +250,13 @@ def check_changes(name: str, changes: Sequence[Change]) -> None:
     """Refuse a setting that the method overrules or its agent does not take."""
     method = find_method(name)
     for change in changes:
-        keyword = change.key
-        if keyword in method.keywords:
+        section, _, keyword = change.key.rpartition(".")
+        if section in ("", "plus", *sections(method.agent)) and keyword in method.keywords:
             raise ValueError(
                 f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "
-                "would have no effect: leave it out, or take --method wpt"
+                "would have no effect: leave it out, or take another --method"
             )
-        if method.shared is not None and keyword in wpt_keywords().keys() - set(method.shared):
+        if method.shared is not None and change.key in wpt_keywords().keys() - set(method.shared):
             raise ValueError(
                 f"--method {name} takes only {', '.join(method.shared) or 'none'} of WPT's "
                 f"keywords, so --set {change} would have no effect: leave it out"

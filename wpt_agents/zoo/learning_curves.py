@@ -1,4 +1,4 @@
-"""The files in which SB3 records how a run learns; this module alone knows their columns.
+"""SB3's files of evaluations and training episodes; only this module depends on their columns.
 
 `evaluations.npz` is written by SB3's EvalCallback, `0.monitor.csv` by its Monitor.
 """
@@ -30,17 +30,17 @@ class Evaluations:
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
-        """Read the file, None if there is no such file."""
+        """Read the file; return None if it does not exist."""
         if not path.exists():
             return None
-        with np.load(path) as arrays:  # without pickle, as NumPy's default is
+        with np.load(path) as arrays:  # NumPy's default allow_pickle=False
             successes = arrays["successes"] if "successes" in arrays else None
             return cls(arrays["timesteps"], arrays["results"], arrays["ep_lengths"], successes)
 
 
 @dataclass(frozen=True)
 class TrainingEpisodes:
-    """The episodes of fine-tuning, in the order in which they ended.
+    """The episodes of fine-tuning, in the order of their ends.
 
     :param lengths: (N,), calls of `env.step`
     :param returns: (N,)
@@ -53,7 +53,7 @@ class TrainingEpisodes:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read the file, which may not exist yet; a line that is half written is left out."""
+        """Read the file, which may not exist yet; an incomplete last line is ignored."""
         rows = []
         if path.exists():
             for line in path.read_text(encoding="utf-8").splitlines(keepends=True)[2:]:

@@ -1,4 +1,4 @@
-"""What this machine has of what a command asks for: an engine's package, a GPU."""
+"""Checks of what a command needs on this machine: an engine's package, a GPU."""
 
 import importlib
 import os
@@ -15,7 +15,7 @@ ENGINES = {"none": "", "local": "", "ray": "ray", "slurm": "submitit"}  # and th
 
 
 def import_extra(name: str, extra: str) -> ModuleType:
-    """The module of an extra, or the line that installs it."""
+    """Import the module of an extra, or raise an error with the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -23,7 +23,7 @@ def import_extra(name: str, extra: str) -> ModuleType:
 
 
 def check_machine(engine: str, device: str) -> None:
-    """Refuses an engine whose package is not here, and a device for runs on this machine."""
+    """Raise an error if the engine's package is not installed or the device is not available."""
     if engine not in ENGINES:
         raise unknown_name("engine", engine, ENGINES)
     if package := ENGINES[engine]:
@@ -33,7 +33,7 @@ def check_machine(engine: str, device: str) -> None:
 
 
 def check_device(device: str) -> None:
-    """Refuses a device that torch does not find; SB3 would take the CPU without a word."""
+    """Raise an error if torch does not find the device; SB3 would use the CPU without a warning."""
     try:
         target = torch.device("cpu" if device == "auto" else device)
     except RuntimeError:
@@ -48,9 +48,9 @@ def check_device(device: str) -> None:
 def choose_threads(size: str | Size | Mapping[str, Any]) -> None:
     """Let torch compute networks narrower than those of `small` on one thread.
 
-    They gain little by a second one, and threads that wait for each other keep a core busy, so that
-    they halve the speed where another process needs it (docs/speed.md). Wider networks use all
-    cores, as torch does by default. OMP_NUM_THREADS overrides this choice.
+    A second thread brings little, and threads that wait for each other keep a core busy, which
+    halves the speed if another process needs it (docs/speed.md). Wider networks use all cores, as
+    torch does by default. OMP_NUM_THREADS overrides this choice.
     """
     if "OMP_NUM_THREADS" not in os.environ and find_size(size).units < SIZES["small"].units:
         torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Where a result comes from: the commit, the machine, and the versions of the packages."""
+"""The origin of a result: commit, machine, and package versions."""
 
 import platform
 import shutil
@@ -18,9 +18,9 @@ SIMULATORS = ("dm-control", "metaworld")
 
 @cache
 def commit() -> str | None:
-    """The checkout's commit, '+' behind it when files differ; None outside a checkout.
+    """Return the checkout's commit, with '+' if files differ; None outside a checkout.
 
-    Asked once, when the first run begins: the code that is at work does not change after that.
+    It is determined once, when the first run starts, because the loaded code does not change later.
     """
     root = Path(__file__).parents[2]
     if shutil.which("git") is None or not (root / ".git").exists():
@@ -36,7 +36,7 @@ def commit() -> str | None:
 
 
 def system() -> dict[str, Any]:
-    """The machine and the versions that a run was made with."""
+    """Return the machine and the versions of a run."""
     return {
         "commit": commit(),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""What a run found, typed; this module alone reads and writes `result.json`.
+"""The typed result of a run; only this module reads and writes `result.json`.
 
 Example::
 
@@ -24,10 +24,10 @@ FILE = "result.json"
 # The policies that a run may score, in the order in which tables show them.
 NOTHING = "nothing"  # the zero action
 RANDOM = "random"  # uniform actions
-PRIOR_ACTOR = "prior actor"  # the clone of the retrieved trajectories
+PRIOR_ACTOR = "prior actor"  # the policy that imitates the retrieved trajectories
 HEAD_START = "after head start"  # the actor when the head start of fine-tuning ended
 LAST = "last"  # the agent at the end of fine-tuning
-BEST = "best"  # the agent that did best in the evaluations during fine-tuning
+BEST = "best"  # the best agent of the evaluations during fine-tuning
 POLICIES = (NOTHING, RANDOM, PRIOR_ACTOR, HEAD_START, LAST, BEST)
 UNTRAINED = (NOTHING, RANDOM)
 
@@ -35,13 +35,13 @@ Metric = Literal["return", "success"]
 
 
 def final_policy(policies: Collection[str]) -> str:
-    """Return the policy that a run counts for: the best one if it kept it, else the last."""
+    """Return the policy that counts for a run: the best one if it was kept, else the last."""
     return BEST if BEST in policies else LAST
 
 
 @dataclass(frozen=True, order=True)
 class Change:
-    """One setting that differs from its preset, as `--set key=value` wrote it."""
+    """One setting that differs from its preset, as in `--set key=value`."""
 
     key: str
     value: str
@@ -64,7 +64,7 @@ class Change:
 @total_ordering
 @dataclass(frozen=True)
 class Variant:
-    """A preset, the settings that differ from it, and the user's own data if there are any.
+    """A preset, the settings that differ from it, and the user's own data, if any.
 
     `str(variant)` is the name that tables and records show: "tiny size=debug data=mine".
 
@@ -78,7 +78,7 @@ class Variant:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `str(variant)` back: from CSV cells and from the result files of version 0.1."""
+        """Parse `str(variant)`, from CSV cells and the result files of version 0.1."""
         preset, *words = shlex.split(text)
         changes = tuple(Change.parse(word) for word in words if not word.startswith("data="))
         data = [word.removeprefix("data=") for word in words if word.startswith("data=")]
@@ -86,7 +86,7 @@ class Variant:
 
     @property
     def words(self) -> list[str]:
-        """The words of `str(variant)`, before quoting."""
+        """Return the words of `str(variant)`, before quoting."""
         data = [] if self.data is None else [f"data={self.data}"]
         return [self.preset, *map(str, self.changes), *data]
 
@@ -98,7 +98,7 @@ class Variant:
 
     @property
     def playing(self) -> Self:
-        """The part that changes how untrained policies are played: env and evaluation settings."""
+        """Return the changes that affect untrained policies: env and evaluation settings."""
         changes = tuple(c for c in self.changes if c.key.startswith(("env.", "evaluate.")))
         return type(self)(self.preset, changes)
 
@@ -115,7 +115,7 @@ class Score:
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Self:
-        """Read a score from a JSON object; what can be computed from the episodes is not read."""
+        """Read a score from a JSON object; values that follow from the episodes are not read."""
         return cls(tuple(stored["returns"]), tuple(stored["successes"]))
 
     @property
@@ -134,7 +134,7 @@ class Score:
         return float(np.mean(self.successes)) if self.successes else None
 
     def counted(self, metric: Metric) -> float:
-        """The number that the score counts as: its success rate, or its mean return."""
+        """Return the score's value by a metric: its success rate, or its mean return."""
         if metric == "return":
             return self.mean
         assert self.success_rate is not None, "a task of metric 'success' reports successes"
@@ -143,16 +143,16 @@ class Score:
 
 @dataclass(frozen=True)
 class Result:
-    """Everything that a finished run found.
+    """The result of a finished run.
 
     :param steps: calls of `env.step` in fine-tuning; `frames` counts simulator frames
     :param scores: by policy, see `POLICIES`
     :param seconds: wall-clock seconds of each stage
-    :param commit: of the code, None outside a checkout
+    :param commit: commit of the code, None outside a checkout
     :param updates: gradient updates of fine-tuning, None if the agent does not count them
     :param cpu_seconds: processor seconds of the learning process, None in results of version 0.1
-    :param model: the first digits of the SHA-256 of the model file that counts
-    :param pretrained: likewise of the pre-trained model that fine-tuning began with, None without
+    :param model: the first digits of the SHA-256 of the final model file
+    :param pretrained: the same for the pre-trained model, None if there is none
     """
 
     suite: str
@@ -173,16 +173,16 @@ class Result:
 
     @property
     def final_policy(self) -> str:
-        """The policy that the run counts for."""
+        """The policy that counts for the run."""
         return final_policy(self.scores)
 
     @property
     def final(self) -> Score:
-        """The score that the run counts for."""
+        """The score that counts for the run."""
         return self.scores[self.final_policy]
 
     def counted(self, policy: str | None = None) -> float:
-        """Return a policy's success rate, or its mean return where the task counts returns.
+        """Return a policy's success rate, or its mean return, depending on the metric.
 
         :param policy: the final one if None
         """
@@ -190,17 +190,17 @@ class Result:
 
     @property
     def identity(self) -> tuple[str, str, Variant, int, int]:
-        """What tells this run from every other: task, method, variant, budget and seed."""
+        """The identity of the run: task, method, variant, budget and seed."""
         return self.task, self.method, self.variant, self.frames, self.seed
 
     @property
     def commit_name(self) -> str:
-        """The commit for a table."""
+        """The commit as shown in tables."""
         return self.commit or "unknown"
 
     @property
     def command(self) -> str:
-        """A command that repeats the run, whatever folder it is typed in."""
+        """A command that repeats the run from any working directory."""
         words = ["python", "-m", "wpt_agents.zoo", "run", "--suite", self.suite]
         words += ["--tasks", self.task, "--method", self.method, "--preset", self.variant.preset]
         words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
@@ -212,9 +212,9 @@ class Result:
 
 
 def read_result(folder: Path) -> Result | None:
-    """Read the result of the run in `folder`, None while it is not finished.
+    """Read the result of the run in `folder`; return None if the run is not finished.
 
-    :raises ValueError: the file is damaged
+    :raises ValueError: if the file is damaged
     """
     path = folder / FILE
     if not path.exists():
@@ -226,18 +226,18 @@ def read_result(folder: Path) -> Result | None:
 
 
 def write_result(folder: Path, result: Result) -> None:
-    """Write the result of the run in `folder`, as a whole or not at all."""
+    """Write the result of the run in `folder` atomically."""
     with replacing(folder / FILE) as temporary:
         temporary.write_text(json.dumps(_to_json(result), indent=1), encoding="utf-8")
 
 
 def read_score(path: Path) -> Score | None:
-    """Read the score in a file of its own, None if there is no such file."""
+    """Read the score in a separate file; return None if there is no such file."""
     return Score.of(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
 
 def write_score(path: Path, score: Score) -> None:
-    """Write one score to a file of its own, as a whole or not at all."""
+    """Write one score to a separate file atomically."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(_score_json(score), indent=1), encoding="utf-8")
 
@@ -250,7 +250,7 @@ def _to_json(result: Result) -> dict[str, Any]:
 
 
 def _score_json(score: Score) -> dict[str, Any]:
-    """Write what can be computed, too: other programs read these files."""
+    """Include derived values, because other programs read these files."""
     mean, low, high = score.interval
     computed = {"mean": mean, "low": low, "high": high, "success_rate": score.success_rate}
     return {"returns": list(score.returns), "successes": list(score.successes), **computed}

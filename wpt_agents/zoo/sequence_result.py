@@ -1,4 +1,4 @@
-"""What a sequence of tasks found; this module alone reads and writes `sequence.json`.
+"""The result of a sequence of tasks; only this module reads and writes `sequence.json`.
 
 Example::
 
@@ -22,11 +22,11 @@ ROW = "scores.json"  # in the folder of each task that is finished
 
 @dataclass(frozen=True)
 class Row:
-    """What was found when a task of the sequence ended.
+    """The scores at the end of one task of the sequence.
 
     :param task: the task that was learned
     :param scores: of this task and all before it, by task
-    :param updates: gradient updates for this task, and PackNet's retraining of the one before it
+    :param updates: updates for this task, including PackNet's retraining of the previous one
     :param seconds: wall-clock seconds of learning it
     :param cpu_seconds: processor seconds of learning it
     """
@@ -45,7 +45,7 @@ class Row:
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """Everything that a sequence has found so far.
+    """All results of a sequence so far.
 
     :param tasks: all tasks, in the order of learning
     :param frames: simulator frames of each task
@@ -66,7 +66,7 @@ class SequenceResult:
 
     @property
     def finished(self) -> bool:
-        """Whether all tasks are finished."""
+        """True if all tasks are finished."""
         return len(self.rows) == len(self.tasks)
 
     @property
@@ -83,28 +83,28 @@ class SequenceResult:
 
 
 def write_row(folder: Path, row: Row) -> None:
-    """Write what was found when a task ended, as a whole or not at all."""
+    """Write the scores at the end of a task atomically."""
     with replacing(folder / ROW) as temporary:
         temporary.write_text(json.dumps(asdict(row), indent=1), encoding="utf-8")
 
 
 def read_row(folder: Path) -> Row | None:
-    """Read what `write_row` wrote, None while the task is not finished."""
+    """Read the file of `write_row`; return None if the task is not finished."""
     path = folder / ROW
     return _row(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
 
 def write_sequence(folder: Path, result: SequenceResult) -> None:
-    """Write the result of a sequence, as a whole or not at all."""
+    """Write the result of a sequence atomically."""
     stored = asdict(result) | {"command": result.command}
     with replacing(folder / FILE) as temporary:
         temporary.write_text(json.dumps(stored, indent=1), encoding="utf-8")
 
 
 def read_sequence(folder: Path) -> SequenceResult | None:
-    """Read the result of the sequence in `folder`, None before its first task is finished.
+    """Read the result of the sequence in `folder`; return None if no task is finished.
 
-    :raises ValueError: the file is damaged
+    :raises ValueError: if the file is damaged
     """
     path = folder / FILE
     if not path.exists():

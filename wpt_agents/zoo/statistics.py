@@ -1,9 +1,9 @@
-"""What many runs say together: aggregates, bootstrap intervals, profiles, comparisons.
+"""Statistics over many runs: aggregates, bootstrap intervals, profiles, comparisons.
 
 The definitions are those of Agarwal et al., Deep RL at the Edge of the Statistical Precipice
-(arXiv:2108.13264), and of their package rliable. `Scores` are one array a stratum, which is a task
-with one score a run, or a seed with one return an episode; strata may differ in length. Every
-statistic takes arrays with leading axes too, as resampling makes them.
+(arXiv:2108.13264), and of their package rliable. `Scores` contain one array per stratum, which is a
+task with one score per run, or a seed with one return per episode; strata may differ in length.
+Every statistic also accepts arrays with leading axes, as resampling produces them.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from math import comb
 
 import numpy as np
 
-Scores = Sequence[np.ndarray]  # (..., n) a stratum
+Scores = Sequence[np.ndarray]  # (..., n) for each stratum
 DRAWS = 20_000
 
 # Student's t at 97.5 % for 1 .. 30 degrees of freedom.
@@ -23,37 +23,37 @@ T_975 = (
 
 
 def mean(scores: Scores) -> np.ndarray:
-    """The mean over strata of each stratum's mean, (...)."""
+    """Return the mean over strata of each stratum's mean, (...)."""
     return np.mean([stratum.mean(-1) for stratum in scores], axis=0)
 
 
 def median(scores: Scores) -> np.ndarray:
-    """The median over strata of each stratum's mean, (...)."""
+    """Return the median over strata of each stratum's mean, (...)."""
     return np.median([stratum.mean(-1) for stratum in scores], axis=0)
 
 
 def iqm(scores: Scores) -> np.ndarray:
-    """The interquartile mean, (...): all scores together, a quarter cut off at each end."""
+    """Return the interquartile mean (...) of all scores: a quarter is cut off at each end."""
     every = np.sort(np.concatenate(scores, axis=-1), axis=-1)
     cut = every.shape[-1] // 4
     return every[..., cut : every.shape[-1] - cut].mean(-1)
 
 
 def optimality_gap(scores: Scores, target: float = 1.0) -> np.ndarray:
-    """By how much all scores together fall short of `target`, (...); what exceeds it counts 0."""
+    """Return the optimality gap (...): the mean of max(0, target - score) over all scores."""
     return target - np.minimum(np.concatenate(scores, axis=-1), target).mean(-1)
 
 
 def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
-    """The share of all scores above each threshold, (..., thresholds)."""
+    """Return the share of all scores above each threshold, (..., thresholds)."""
     every = np.concatenate(scores, axis=-1)
     return np.stack([(every > threshold).mean(-1) for threshold in thresholds], axis=-1)
 
 
 def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
-    """How likely a run of ours beats one of theirs on the same task, ties half; mean over tasks.
+    """Return the probability that our run beats theirs on a task (ties: 1/2), averaged over tasks.
 
-    :param ours: a stratum a task, in the same order as `theirs`
+    :param ours: one stratum per task, in the same order as `theirs`
     """
     assert len(ours) == len(theirs), (len(ours), len(theirs))
     chances = []
@@ -64,19 +64,19 @@ def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
 
 
 def resample(scores: Scores, draws: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """The stratified bootstrap: draw each stratum from itself, (draws, n) for each one."""
+    """Resample within each stratum (stratified bootstrap); return (draws, n) for each one."""
     return [s[rng.integers(len(s), size=(draws, len(s)))] for s in scores]
 
 
 def resamplable(scores: Scores) -> bool:
-    """Whether each stratum has several scores: of a single one the bootstrap sees no spread."""
+    """Return whether each stratum has several scores, which the bootstrap requires."""
     return all(len(stratum) > 1 for stratum in scores)
 
 
 def bootstrap(
     statistic: Callable[..., np.ndarray], *groups: Scores, draws: int = DRAWS, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The 95 % percentile interval of `statistic(*groups)`, each group resampled separately.
+    """Return the 95 % percentile interval of `statistic(*groups)`; groups are resampled separately.
 
     :param groups: each a sequence of (n,) strata
     :return: lower and upper end, each of the statistic's shape
@@ -88,17 +88,17 @@ def bootstrap(
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
-    """The mean and its 95 % interval by Student's t; no interval from one value."""
+    """Return the mean and its 95 % interval by Student's t; None for the interval of one value."""
     middle, n = float(np.mean(values)), len(values)
     if n < 2:
         return middle, None, None
-    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # within 0.005
+    t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # accurate to 0.005
     half = t * float(np.std(values, ddof=1)) / n**0.5
     return middle, middle - half, middle + half
 
 
 def sign_test(above: int, below: int) -> float:
-    """Return the two-sided p value of the sign test; ties are left out before.
+    """Return the two-sided p value of the sign test, without ties.
 
     p = 2 sum_{k >= max(above, below)} C(n, k) / 2^n with n = above + below, and at most 1.
     """

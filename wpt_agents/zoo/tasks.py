@@ -1,4 +1,4 @@
-"""From what a user types to rows of the task table."""
+"""Convert the task names that a user types to rows of the task table."""
 
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
@@ -11,10 +11,10 @@ from wpt_agents.zoo.result import Metric
 
 
 def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
-    """The tasks of a suite that match: 'walker-run', 'dmc-walker-run', or a pattern, 'walker-*'.
+    """Return the matching tasks of a suite: 'walker-run', 'dmc-walker-run', or 'walker-*'.
 
-    No pattern: the paper's tasks of the suite, or all of them if the paper has none. A prefix may
-    name another suite, 'dmc-walker-run'.
+    Without a pattern, these are the paper's tasks of the suite, or all if the paper has none. A
+    prefix may name another suite, as in 'dmc-walker-run'.
     """
     if suite not in (suites := {row.suite for row in table.TASKS.values()}):
         raise unknown_name("suite", suite, suites)
@@ -42,22 +42,22 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
 
 
 def short_name(task: Task) -> str:
-    """'dmc-walker-run', as folders and tables call it."""
+    """Return the name in folders and tables, for example 'dmc-walker-run'."""
     return f"{task.suite}-{task.name}"
 
 
 def name_in_data(task: Task, names: Collection[str | None]) -> str | None:
-    """Return the name that data have for a task, or None if they have none.
+    """Return the name of a task in a dataset, None if the dataset does not contain it.
 
-    Data that were collected have its id. The authors' data of Meta-World have its name alone.
+    Collected data use the task's id, the authors' Meta-World data only its name.
 
-    :param names: the tasks of the data
+    :param names: the tasks of the dataset
     """
     known = (task.id, short_name(task), task.name)
     return next((name for name in known if name in names), None)
 
 
 def metric_of(task: Task) -> Metric:
-    """Return what the task counts, typed."""
+    """Return the task's metric, typed."""
     assert task.metric in ("return", "success"), task
     return "success" if task.metric == "success" else "return"

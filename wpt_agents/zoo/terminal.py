@@ -1,4 +1,4 @@
-"""What the runner prints: the shared console, one line per stage, and progress bars."""
+"""The runner's output: the shared console, one line per stage, and progress bars."""
 
 import sys
 from collections.abc import Iterator
@@ -12,14 +12,14 @@ console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isat
 
 
 def say(stage: str, text: str) -> None:
-    """One line about a stage, above its progress bar."""
+    """Print a line about a stage, above its progress bar."""
     console.print(f"[bold]{stage:<10}[/bold]{text}")
 
 
 def progress(
     total: int | None, label: str, unit: str, done: int = 0, hide: bool = False
 ) -> "tqdm[None]":
-    """A bar on the terminal, or a line every ten seconds in a log file."""
+    """Show a progress bar on a terminal, or print a line every ten seconds into a log file."""
     interval = 0.2 if sys.stderr.isatty() else 10
     return tqdm(
         total=total, initial=done, desc=label, unit=f" {unit}", mininterval=interval, disable=hide
@@ -38,4 +38,4 @@ def logged(path: Path) -> Iterator[None]:
             yield
         finally:
             sys.stdout, sys.stderr = streams
-            console.file = None  # type: ignore[assignment]  # rich's word for "sys.stdout"
+            console.file = None  # type: ignore[assignment]  # in rich it means sys.stdout

@@ -10,10 +10,10 @@ from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
 
-STORED_STEP = 2_500  # bytes of an image in the dataset, which compresses without loss
+STORED_STEP = 2_500  # bytes of an image in the dataset, which uses lossless compression
 RAW_STEP = 12_288  # bytes of an image in the replay
 PARAMETERS = {"debug": 0.2e6, "tiny": 0.8e6, "small": 3e6, "mid": 6e6, "medium": 18e6}
-PARAMETERS |= {"none": 6e6}  # of agents without sizes: DrQ-v2 as it was published
+PARAMETERS |= {"none": 6e6}  # for agents without sizes: DrQ-v2 as published
 LARGEST = 300e6  # parameters of the size "paper"
 WEIGHT = 12  # bytes per parameter in a model file: its value and the optimiser's two averages
 
@@ -25,11 +25,11 @@ def disk_needed(jobs: Sequence[Run]) -> int:
     total = 0
     for path, shared in data.items():
         if not path.exists():
-            steps = 1000 // shared.preset.env.action_repeat  # of the longest episodes
+            steps = 1000 // shared.preset.env.action_repeat  # assumes the longest episodes
             total += shared.preset.collect.episodes * len(shared.tasks) * steps * STORED_STEP
     models = [model_bytes(job) for job in left]
     replay = max((job.preset.steps * RAW_STEP for job in left), default=0)
-    checkpoints = 2 * max(models, default=0)  # only the run that is going on has them
+    checkpoints = 2 * max(models, default=0)  # only the current run has them
     return total + 2 * sum(models) + checkpoints + replay  # each run keeps its last and best model
 
 
@@ -41,7 +41,7 @@ def model_bytes(job: Run) -> int:
 
 
 def check_space(jobs: Sequence[Run]) -> None:
-    """Refuse a plan that the disk has no room for."""
+    """Raise an error if the disk has too little space for the plan."""
     folder = jobs[0].out.resolve()
     while not folder.exists():
         folder = folder.parent
@@ -55,9 +55,9 @@ def check_space(jobs: Sequence[Run]) -> None:
 
 
 def hours_needed(left: Sequence[Run], like: Run) -> float | None:
-    """Return the hours that the runs will take, by the finished runs of the same preset.
+    """Estimate the hours that the runs will take from finished runs of the same preset.
 
-    :return: None if no run of the preset is finished
+    :return: the hours, None if no run of the preset is finished
     """
     folder = like.out / like.preset_name
     known = read_results(folder) if folder.exists() else []
@@ -67,12 +67,12 @@ def hours_needed(left: Sequence[Run], like: Run) -> float | None:
 
 
 def gigabytes(size: int) -> str:
-    """Write a number of bytes as '2.5 GB'."""
+    """Format a number of bytes as '2.5 GB'."""
     return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.0f} MB"
 
 
 def summary(jobs: Sequence[Run], force: bool = False) -> str:
-    """Summarise a plan in one line; with `force`, finished runs are to do, too."""
+    """Summarise a plan in one line; with `force`, finished runs are repeated."""
     left = [job for job in jobs if force or read_result(job.folder) is None]
     hours = hours_needed(left, jobs[0])
     time = (

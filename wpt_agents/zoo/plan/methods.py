@@ -1,4 +1,4 @@
-"""The methods that the runner knows: an agent, its keywords, and the shared stages it needs.
+"""The runner's methods: an agent, its keywords, and the shared stages that it needs.
 
 To add a method of WPT, add one entry to `METHODS` with the keywords that differ from the preset.
 To add another agent, write it as a file of `wpt_agents/agents/` and name its class here::
@@ -6,15 +6,15 @@ To add another agent, write it as a file of `wpt_agents/agents/` and name its cl
     "dreamer-v3": Method(keywords=DREAMER_V3, pretrained=False, needs_data=False),
     "drq-v2": Method(DrQv2, shared=(), policy="CnnPolicy", pretrained=False, needs_data=False),
 
-With a name in `AGENTS` it has a section in the presets, whose keys are its keywords; a subclass
-also takes the keywords in the section of its base.
+A name in `AGENTS` gives it a section in the presets, whose keys are its keywords; a subclass also
+uses the section of its base.
 
-The stages (`wpt_agents.zoo.run`) ask of an agent what Stable-Baselines3 asks, so its own algorithms
-run too: `agent(policy, env, seed=, device=, **keywords)`, `learn`, `predict`, `save`, `load`. They
-use what else there is: keywords `dataset`, `embodiment` and `episode_length` in the signature, a
+The stages (`wpt_agents.zoo.run`) need the interface of Stable-Baselines3, so SB3's own algorithms
+work too: `agent(policy, env, seed=, device=, **keywords)`, `learn`, `predict`, `save`, `load`. They
+also use, if available: keywords `dataset`, `embodiment` and `episode_length` in the signature, a
 classmethod `pretrain` (required if `pretrained`), `prior` (the policy scored as "prior actor"),
 `build_index`, `open_loop`, `updates`, and a `replay_buffer` of `wpt_agents.data.replay` together
-with `episodes`, without which a killed run begins again instead of resuming.
+with `episodes`, without which a killed run restarts instead of resuming.
 """
 
 import inspect
@@ -36,14 +36,14 @@ from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 
-# What the stages themselves hand to an agent, so no preset may.
+# Keywords that the stages pass to an agent, so presets must not set them.
 RESERVED = {
     *("self", "policy", "env", "dataset", "seed", "device", "verbose", "tensorboard_log"),
     *("embodiment", "episode_length", "policy_kwargs"),
 }
 
 
-# The sections of the presets that hold an agent's keywords, a base before its subclasses.
+# The sections of the presets with an agent's keywords, a base before its subclasses.
 AGENTS: dict[str, type[BaseAlgorithm]] = {
     "drqv2": DrQv2,
     "jsrl": JSRL,
@@ -53,16 +53,16 @@ AGENTS: dict[str, type[BaseAlgorithm]] = {
     "rlpd": RLPD,
     "sac": SAC,
 }
-FRAMES = 3  # images that SB3's agents see at once, as ours do
+FRAMES = 3  # stacked images for SB3's agents, as for ours
 
 
 def stacked(venv: VecEnv) -> VecEnv:
-    """Stack the last images of each environment, for agents that see one observation."""
+    """Stack the last images of each environment, for agents without memory."""
     return VecFrameStack(venv, FRAMES, channels_order="last")
 
 
 def sections(agent: type[BaseAlgorithm]) -> list[str]:
-    """Return the sections of the presets whose keywords an agent takes."""
+    """Return the sections of the presets whose keywords an agent accepts."""
     return [name for name, known in AGENTS.items() if issubclass(agent, known)]
 
 
@@ -71,14 +71,13 @@ class Method:
     """One algorithm with its settings.
 
     :param agent: the class
-    :param keywords: of the agent; they overrule the preset's
+    :param keywords: keywords of the agent, which override the preset's
     :param pretrained: whether it starts from a pre-trained model
-    :param needs_data: whether it uses the data that were collected
-    :param shared: keywords of the preset's section `wpt` that the agent takes under the same name;
-        None for all, as WPT does
+    :param needs_data: whether it uses the collected data
+    :param shared: keywords of the preset's section `wpt` that the agent shares; None for all
     :param policy: the first argument of the agent
-    :param plus: whether the preset's section `plus` applies: what we add to the paper's algorithm
-    :param wrap: what the agent needs around its environments; SB3's agents with several frames need
+    :param plus: whether the preset's section `plus` applies, our additions to the paper's algorithm
+    :param wrap: the wrapper of the agent's environments; SB3's agents with several frames need
         `VecTransposeImage(VecFrameStack(venv, n))`
     """
 
@@ -93,11 +92,11 @@ class Method:
 
     @property
     def section(self) -> str:
-        """The section of `config.yaml` that holds the agent's keywords."""
+        """The section of `config.yaml` with the agent's keywords."""
         return self.agent.__name__.lower()
 
     def settings(self, wpt: Mapping[str, Any], specific: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the keywords that the agent is made with.
+        """Return the agent's keywords.
 
         :param wpt: the preset's section `wpt`
         :param own: the keywords of the agent's own sections
@@ -121,11 +120,11 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
 
 
 NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
-ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data beside the replay
-# DreamerV3 from scratch, by the settings of its code for images of DMControl. Left out are its
+ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data except the replay buffer
+# DreamerV3 from scratch, with the settings of its code for images of DMControl. Differences: its
 # optimiser, norms and pooling, the spacing of its bins, and the critic's regulariser on replayed
-# states. Its returns bootstrap from the critic, ours from the target critic. The continue head
-# makes no difference where no episode ends early.
+# states are not used. Its returns bootstrap from the critic, ours from the target critic. The
+# continue head has no effect if no episode ends early.
 DREAMER_V3 = {
     **ALONE,
     "gamma": 0.997,
@@ -144,7 +143,7 @@ METHODS = {
     "wpt": Method(),
     "wpt+": Method(plus=True),
     "kickstart": Method(keywords={"kickstart": 20.0}),
-    # Scratch has every addition that needs neither data nor a clone.
+    # Scratch has every addition that needs neither data nor a prior actor.
     "scratch": Method(keywords=ALONE, pretrained=False, needs_data=False, plus=True),
     "pretrain-only": Method(keywords=ALONE),
     "no-guidance": Method(keywords=NO_CLONE),
@@ -155,18 +154,18 @@ METHODS = {
     "drq-v2": Method(DrQv2, **MODEL_FREE, needs_data=False),
     "r3m": Method(R3M, shared=(), policy="CnnPolicy"),
     "jsrl-bc": Method(JSRL, **MODEL_FREE),
-    # For a sequence of tasks; on a single one it is DrQ-v2.
+    # For a sequence of tasks; on a single task it equals DrQ-v2.
     "packnet": Method(PackNet, **MODEL_FREE, needs_data=False),
     "uds": Method(RLPD, {"label": "zero"}, **MODEL_FREE),
     "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
-    # An upper bound for the two before it: with --data that hold rewards (`collect --rewards`).
+    # An upper bound for the previous two: needs --data with rewards (`collect --rewards`).
     "rlpd": Method(RLPD, {"label": "true"}, **MODEL_FREE),
-    # From after the paper: the strongest model-free method that a CPU can run.
+    # More recent than the paper: the strongest model-free method that is feasible on a CPU.
     "mrq": Method(MRQ, **MODEL_FREE, needs_data=False),
-    # As SB3 ships it: what a user has without this library.
+    # SB3's own algorithm: the alternative without this library.
     "sac": Method(SAC, **MODEL_FREE, needs_data=False, wrap=stacked),
 }
-# The methods of the ablation in Fig. 5, by the parts that are on.
+# The methods of the ablation in Fig. 5, by their enabled parts.
 ABLATION = {
     "scratch": "none",
     "pretrain-only": "P",
@@ -178,7 +177,7 @@ ABLATION = {
 def find_method(name: str) -> Method:
     """Return the method of this name.
 
-    :raises ValueError: there is none
+    :raises ValueError: if there is none
     """
     if name not in METHODS:
         raise unknown_name("method", name, METHODS)

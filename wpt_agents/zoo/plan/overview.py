@@ -13,7 +13,7 @@ from wpt_agents.zoo.terminal import console
 
 
 def show_plan(jobs: Sequence[Run], force: bool) -> None:
-    """Print what would be done, and what exists already."""
+    """Print the plan and what exists already."""
     table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
     for job in jobs:
         done = read_result(job.folder) or read_row(job.folder)

@@ -1,4 +1,4 @@
-"""What a run is to do: zoo/<suite>.yaml, read, merged and checked before any work begins."""
+"""The settings of a run: zoo/<suite>.yaml, merged and validated before any work starts."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -15,16 +15,16 @@ from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
 
-EXPLORATION_KEYWORDS = ("steps",)  # of `collect --behaviour explore-state`
+EXPLORATION_KEYWORDS = ("steps",)  # for `collect --behaviour explore-state`
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a preset: a dataclass that refuses unknown keys and wrong types."""
+    """A part of a preset: a dataclass that rejects unknown keys and wrong types."""
 
     @classmethod
     def of(cls, title: str, values: Mapping[str, Any]) -> Self:
-        """Builds the section `title` from what a YAML file or --set gives."""
+        """Build the section `title` from the content of a YAML file or --set."""
         types = get_type_hints(cls)
         for key, value in values.items():
             if key not in types:
@@ -38,7 +38,7 @@ class Section:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value read from YAML may stand in a field of type `kind`."""
+    """Return whether a YAML value is valid for a field of type `kind`."""
     if kind in (int, float):
         return isinstance(value, (int, kind)) and not isinstance(value, bool)
     if kind in (str, bool):
@@ -48,7 +48,7 @@ def _fits(value: Any, kind: Any) -> bool:
 
 @dataclass(frozen=True)
 class EnvSettings(Section):
-    """How the tasks are simulated; these are keyword arguments of `gym.make`."""
+    """Settings of the simulation, which are keyword arguments of `gym.make`."""
 
     action_repeat: int = 2
     rendering: str = "near"
@@ -56,7 +56,7 @@ class EnvSettings(Section):
 
 @dataclass(frozen=True)
 class CollectSettings(Section):
-    """The non-curated data: `episodes` of each of `tasks`, of "noise" or of "scripted" policies."""
+    """The non-curated data: `episodes` of each of `tasks`, with "noise" or "scripted" policies."""
 
     tasks: tuple[str, ...] = ()
     episodes: int = 30
@@ -68,8 +68,8 @@ class CollectSettings(Section):
 class PretrainSettings(Section):
     """Pre-training of the world model, the same for every seed of a run.
 
-    `model` names a model that comes with the library, which is then used and not trained again;
-    `model=` (empty) makes it by `steps` updates.
+    `model` names a pre-trained model that comes with the library; `model=` (empty) trains a new one
+    with `steps` updates.
     """
 
     steps: int = 200_000
@@ -79,11 +79,11 @@ class PretrainSettings(Section):
 
 @dataclass(frozen=True)
 class LearnSettings(Section):
-    """Fine-tuning; frames are the simulator's, `env.step` calls times the action repeat.
+    """Fine-tuning; frames are simulator frames, `env.step` calls times the action repeat.
 
     A killed run resumes from the last multiple of `checkpoint_every` frames; 0: only from the end.
-    With `train_freq: step` the environment has a process of its own and steps beside the updates;
-    `overlap: false` keeps it in the learner's, which learns the same.
+    With `train_freq: step` the environment has its own process and steps during the updates;
+    `overlap: false` keeps it in the learner's process, with the same results.
     """
 
     frames: int = 150_000
@@ -95,8 +95,8 @@ class LearnSettings(Section):
 class EvaluateSettings(Section):
     """Evaluation: `episodes` at the end, and `during_episodes` every `every` frames (0: never).
 
-    With `keep_best` the policy that did best in between is scored at the end, on other episodes,
-    and the last one beside it.
+    With `keep_best`, the best policy of these evaluations and the last one are scored at the end,
+    on other episodes.
     """
 
     episodes: int = 10
@@ -107,10 +107,10 @@ class EvaluateSettings(Section):
 
 @dataclass(frozen=True)
 class Preset:
-    """Everything a run is to do, apart from task, method and seed.
+    """All settings of a run, except task, method and seed.
 
-    :param wpt: keyword arguments of WPT and nothing else
-    :param plus: those that the methods `wpt+` and `scratch` use besides: additions to the paper
+    :param wpt: keyword arguments of WPT
+    :param plus: additional ones of the methods `wpt+` and `scratch`: additions to the paper
     :param agents: the keyword arguments of other agents, by the names of `methods.AGENTS`
     """
 
@@ -153,7 +153,7 @@ class Preset:
 
     @classmethod
     def of(cls, values: Mapping[str, Mapping[str, Any]]) -> Self:
-        """Builds a preset from the sections of a YAML file."""
+        """Build a preset from the sections of a YAML file."""
         types = get_type_hints(cls)
         for title, section in values.items():
             if title not in {*types, *AGENTS} - {"agents"}:
@@ -167,7 +167,7 @@ class Preset:
 
     @property
     def steps(self) -> int:
-        """The calls of `env.step` that `learn.frames` simulator frames make."""
+        """The number of `env.step` calls in `learn.frames` simulator frames."""
         return self.learn.frames // self.env.action_repeat
 
     @property
@@ -176,10 +176,10 @@ class Preset:
         return Hyperparameters.of(self.wpt).size
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain dictionaries and lists, as `config.yaml` shows them."""
+        """Return plain dictionaries and lists, as in `config.yaml`."""
         values = asdict(self)
-        del values["plus"]  # a run's `wpt` holds what of it applies
-        del values["agents"]  # a run's own section holds its agent's keywords
+        del values["plus"]  # a run's `wpt` contains the part that applies
+        del values["agents"]  # a run's own section contains its agent's keywords
         return values | {"collect": values["collect"] | {"tasks": list(self.collect.tasks)}}
 
 
@@ -189,7 +189,7 @@ def wpt_keywords() -> Mapping[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML in which 1e-4 is a number: YAML 1.1 asks for 1.0e-4 and takes it for text."""
+    """A safe YAML loader that reads 1e-4 as a number, which YAML 1.1 reads as text."""
 
 
 _Loader.add_implicit_resolver(
@@ -200,12 +200,12 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(text: str) -> Any:
-    """The value of a YAML document, no code ever run."""
+    """Return the value of a YAML document without running any code."""
     return yaml.load(text, Loader=_Loader)  # a SafeLoader
 
 
 def preset_folder() -> Path:
-    """Where the YAML files stand: zoo/ in a checkout, wpt_agents/zoo/presets in a wheel."""
+    """Return the folder of the YAML files: zoo/ in a checkout, zoo/presets in a wheel."""
     here = Path(__file__).resolve().parents[1]
     for folder in (here / "presets", here.parents[1] / "zoo"):
         if any(folder.glob("*.yaml")):
@@ -214,17 +214,17 @@ def preset_folder() -> Path:
 
 
 def suite_names() -> list[str]:
-    """The suites that have presets."""
+    """Return the suites that have presets."""
     return sorted(path.stem for path in preset_folder().glob("*.yaml"))
 
 
 def preset_names(suite: str) -> list[str]:
-    """The names of a suite's presets, as they stand in its file."""
+    """Return the names of a suite's presets, in the order of its file."""
     return list(_read_suite(suite).presets)
 
 
 class SuiteFile(NamedTuple):
-    """The content of zoo/<suite>.yaml."""
+    """Return the content of zoo/<suite>.yaml."""
 
     default: Mapping[str, Any]
     presets: Mapping[str, Any]
@@ -239,7 +239,7 @@ def _read_suite(suite: str) -> SuiteFile:
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is not valid YAML: {error}") from None
     if not isinstance(content, dict) or set(content) != {"default", "presets"}:
-        raise ValueError(f"{path} must hold the two sections `default` and `presets`.")
+        raise ValueError(f"{path} must have the two sections `default` and `presets`.")
     return SuiteFile(**content)
 
 
@@ -249,7 +249,7 @@ def load_preset(
     settings: Sequence[str] = (),
     changes: Sequence[Mapping[str, Mapping[str, Any]]] = (),
 ) -> Preset:
-    """The preset `name` of `suite`, changed by `changes` and then by `settings`.
+    """Return the preset `name` of `suite`, changed by `changes` and then by `settings`.
 
     :param settings: each "section.key=value", or "key=value" for a keyword of WPT, also in `plus`
     :param changes: sections in the form of the YAML files
@@ -269,10 +269,10 @@ def load_preset(
 
 
 def keywords(settings: Sequence[str], valid: Collection[str] | None = None) -> dict[str, Any]:
-    """Return keywords from "key=value" each.
+    """Return keywords from strings "key=value".
 
-    :param valid: their names; those of WPT if None
-    :raises ValueError: another name
+    :param valid: valid names; those of WPT if None
+    :raises ValueError: if a name is unknown
     """
     names = wpt_keywords() if valid is None else valid
     values: dict[str, Any] = {}
@@ -285,7 +285,7 @@ def keywords(settings: Sequence[str], valid: Collection[str] | None = None) -> d
 
 
 def _setting(text: str) -> dict[str, dict[str, Any]]:
-    """Reads 'learn.frames=1000' as {'learn': {'frames': 1000}}; without a dot it is WPT's."""
+    """Read 'learn.frames=1000' as {'learn': {'frames': 1000}}; keys without a dot are WPT's."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise ValueError(f"--set takes key=value, got {text!r}.")

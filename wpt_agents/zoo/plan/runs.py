@@ -1,4 +1,4 @@
-"""Runs as data, and from the words of a command to the list of them, checked before any begins."""
+"""Runs as data, and their creation and validation from the options of a command."""
 
 import shlex
 import sys
@@ -25,7 +25,7 @@ from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
 
-EVALUATION = 1  # the purpose in a seed's derivation: evaluation never sees training's episodes
+EVALUATION = 1  # separates the seeds of evaluation from those of training
 
 
 def this_command() -> str:
@@ -35,13 +35,13 @@ def this_command() -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """One run: a task, a method and a seed under the settings of a preset. Data, no more.
+    """One run: a task, a method and a seed with the settings of a preset.
 
     :param changes: of the preset, sorted by key
     :param data: the user's own dataset, None for the preset's
-    :param data_name: how the user wrote `data`, which may have been made absolute since
-    :param command: what the user typed, whichever process does the run
-    :param sequence: the name of the sequence of tasks that this is one task of, empty for none
+    :param data_name: `data` as the user wrote it; `data` itself may be absolute
+    :param command: the user's command, regardless of the process that executes the run
+    :param sequence: the name of the sequence of tasks that the run belongs to, or empty
     """
 
     task: Task
@@ -63,19 +63,19 @@ class Run:
 
     @property
     def algorithm(self) -> Method:
-        """The method of this name: agent, keywords, and what it needs."""
+        """The method: agent, keywords, and what it needs."""
         return find_method(self.method)
 
     @property
     def variant(self) -> Variant:
-        """The preset with all that was changed of it but the budget, which stands apart."""
+        """The preset with its changes, except the budget."""
         changes = tuple(sorted(c for c in self.changes if c.key != "learn.frames"))
         data = self.data_name or str(self.data) if self.data is not None else None
         return Variant(self.preset_name, changes, data)
 
     @property
     def folder(self) -> Path:
-        """out/preset/method/task_seed, the layout that RL Zoo's plots read.
+        """out/preset/method/task_seed, the layout that RL Zoo's plots expect.
 
         A task of a sequence is in out/preset/method/sequence_seed/task.
         """
@@ -86,7 +86,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        """What the run is, for a heading: task, method and seed."""
+        """The run's heading: task, method and seed."""
         return f"{short_name(self.task)}, {self.method}, seed {self.seed}"
 
     @property
@@ -100,14 +100,14 @@ class Run:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """The keywords of the agent, the method's own included."""
+        """The keywords of the agent, including the method's own."""
         plus = self.preset.plus if self.algorithm.plus else {}
         specific = self.preset.of_agent(self.algorithm.agent)
         return self.algorithm.settings({**self.preset.wpt, **plus}, specific)
 
     @property
     def full_keywords(self) -> Mapping[str, Any]:
-        """The keywords of the agent with the defaults, or its size's own, of those not set."""
+        """The keywords of the agent, with defaults (or those of its size) for the ones not set."""
         agent = self.algorithm.agent
         values = {**defaults(agent), **self.keywords}
         if issubclass(agent, PixelAgent):
@@ -116,7 +116,7 @@ class Run:
 
     @property
     def retrieves(self) -> bool:
-        """Whether the run needs trajectories of the task's own robot from the dataset."""
+        """Whether the run needs trajectories of the task's robot from the dataset."""
         if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
             return self.algorithm.needs_data
         wpt = SimpleNamespace(**self.full_keywords)
@@ -126,7 +126,7 @@ class Run:
 
     @property
     def updates(self) -> int | None:
-        """The updates that fine-tuning will make, within an episode's worth; None if unknown."""
+        """The approximate number of updates of fine-tuning; None if unknown."""
         agent = SimpleNamespace(**self.full_keywords)
         if hasattr(agent, "update_every"):
             paying = max(self.preset.steps - int(agent.learning_starts), 0)
@@ -140,12 +140,12 @@ class Run:
 
     @property
     def evaluation_seed(self) -> int:
-        """The seed of evaluation's episodes; below 2**31, as some simulators require."""
+        """The seed of the evaluation episodes; below 2**31, as some simulators require."""
         state = np.random.SeedSequence([self.seed, EVALUATION]).generate_state(1)
         return int(state[0] >> 1)
 
     def config(self) -> dict[str, Any]:
-        """Return the resolved configuration, as `config.yaml` holds it."""
+        """Return the resolved configuration, the content of `config.yaml`."""
         names = {"suite": self.task.suite, "task": self.task.id, "method": self.method}
         data = {"data": self.shared.data_source} if self.data is not None else {}
         sections = self.preset.as_dict()
@@ -191,8 +191,8 @@ def make_plan(
 ) -> list[Run]:
     """Return one run for each task, method and seed.
 
-    :param sections: changes of the preset before those of `settings`
-    :raises ValueError: an invalid name or setting
+    :param sections: changes to the preset, applied before those of `settings`
+    :raises ValueError: if a name or setting is invalid
     """
     rows = find_tasks(suite, tasks)
     resolved = load_preset(suite, preset, settings, sections)
@@ -236,7 +236,7 @@ def action_widths(suite: str, preset: Preset, data: Path | None) -> set[int]:
 
 
 def check_preset(preset: Preset) -> None:
-    """Refuse values that the presets' types allow and the stages do not."""
+    """Raise an error for values that have the right type but that the stages do not support."""
     Hyperparameters.of(preset.wpt)
     for name, value, known in (
         ("env.rendering", preset.env.rendering, QUALITIES),
@@ -247,7 +247,7 @@ def check_preset(preset: Preset) -> None:
 
 
 def check_changes(name: str, changes: Sequence[Change]) -> None:
-    """Refuse a setting that the method overrules or its agent does not take."""
+    """Raise an error for a setting that the method overrides or its agent does not accept."""
     method = find_method(name)
     for change in changes:
         section, _, keyword = change.key.rpartition(".")
@@ -264,7 +264,7 @@ def check_changes(name: str, changes: Sequence[Change]) -> None:
 
 
 def check_width(run: Run, widths: Collection[int]) -> None:
-    """Refuse a task that the model cannot act in, or whose robot does not occur in the data.
+    """Raise an error for a task that does not fit the model or whose robot is not in the data.
 
     :param widths: the numbers of actions that occur in the data
     """

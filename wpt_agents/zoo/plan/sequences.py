@@ -1,4 +1,4 @@
-"""Sequences of tasks that one agent learns one after the other, as in Fig. 4 of the paper.
+"""Sequences of tasks that one agent learns in turn, as in Fig. 4 of the paper.
 
 A sequence is a file of zoo/sequences: its suite, its tasks, and changes of the suite's presets.
 """
@@ -18,7 +18,7 @@ from wpt_agents.zoo.plan.runs import Run, make_plan
 class TaskSequence:
     """The content of zoo/sequences/<name>.yaml.
 
-    :param default: changes of every preset, in the presets' own form
+    :param default: changes to every preset, in the format of presets
     :param presets: further changes, by the presets' names
     """
 
@@ -28,7 +28,7 @@ class TaskSequence:
     presets: Mapping[str, Mapping[str, Mapping[str, Any]]]
 
     def changes(self, preset: str) -> list[Mapping[str, Mapping[str, Any]]]:
-        """Return the changes of a preset, in their order."""
+        """Return the changes to a preset, in order."""
         return [self.default, self.presets.get(preset, {})]
 
 
@@ -50,11 +50,11 @@ class SequenceRun:
 
     @property
     def title(self) -> str:
-        """What is done, for a heading: sequence, method and seed."""
+        """The heading: sequence, method and seed."""
         return f"sequence {self.name}, {self.runs[0].method}, seed {self.runs[0].seed}"
 
     def config(self) -> dict[str, Any]:
-        """Return the resolved configuration, as `config.yaml` holds it."""
+        """Return the resolved configuration, the content of `config.yaml`."""
         tasks = [run.task.id for run in self.runs]
         return self.runs[0].config() | {"task": self.name, "tasks": tasks}
 
@@ -67,7 +67,7 @@ def sequence_names() -> list[str]:
 def find_sequence(name: str) -> TaskSequence:
     """Return the sequence of this name.
 
-    :raises ValueError: there is none
+    :raises ValueError: if there is none
     """
     if name not in sequence_names():
         raise unknown_name("sequence", name, sequence_names())
@@ -77,7 +77,7 @@ def find_sequence(name: str) -> TaskSequence:
 
 
 def able_methods() -> list[str]:
-    """Return the methods whose agents can begin the next task of a sequence."""
+    """Return the methods whose agents can continue with the next task of a sequence."""
     return [name for name, method in METHODS.items() if hasattr(method.agent, "next_task")]
 
 
@@ -94,7 +94,7 @@ def make_sequences(
 ) -> list[SequenceRun]:
     """Return the sequence for each method and seed.
 
-    :raises ValueError: an invalid name or setting, or a method that learns single tasks only
+    :raises ValueError: if a name or setting is invalid, or the method learns only single tasks
     """
     sequence = find_sequence(name)
     for method in methods:

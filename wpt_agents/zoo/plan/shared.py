@@ -1,7 +1,7 @@
-"""What several runs share, as data: which dataset, which pre-trained model, and where they stand.
+"""The stages that runs share, as data: the dataset, the pre-trained model, and their folders.
 
-Shared stages stand in `<out>/cache`, each in a folder named by a hash of all that it depends on.
-`wpt_agents.zoo.run.shared` makes them.
+Shared stages are in `<out>/cache`, each in a folder named by a hash of everything it depends on.
+`wpt_agents.zoo.run.shared` executes them.
 """
 
 import hashlib
@@ -33,10 +33,10 @@ def key(*parts: Any) -> str:
 class Shared:
     """The shared stages of a preset.
 
-    :param cache: the folder that holds them
+    :param cache: their parent folder
     :param workers: the number of processes that collect
     :param device: the device to pre-train on
-    :param given_data: a dataset to use in place of the preset's
+    :param given_data: a dataset to use instead of the preset's
     :param accumulate: the number of passes over a batch of pre-training
     :param agent: the class that is pre-trained
     """
@@ -57,7 +57,7 @@ class Shared:
 
     @property
     def tasks(self) -> list[str]:
-        """The ids of the tasks that data are collected on."""
+        """The ids of the tasks to collect data on."""
         return [row.id for row in find_tasks(self.suite, self.preset.collect.tasks)]
 
     @property
@@ -77,14 +77,14 @@ class Shared:
 
     @property
     def data_source(self) -> str:
-        """A name of the data that does not depend on where they lie."""
+        """A name of the data that does not depend on their path."""
         if self.given_data is None:
             return self.data_path.name
         return TrajectoryDataset.open(self.data_path).fingerprint
 
     @property
     def pretraining(self) -> Mapping[str, Any]:
-        """The preset's keywords of the agent that pre-training looks at."""
+        """The preset's keywords of the agent that affect pre-training."""
         if self.agent is not WPT and issubclass(self.agent, PixelAgent):
             looked_at = self.agent.keywords.of_stages(Stage.SIZE, Stage.PRETRAINING)
             return {k: v for k, v in self.preset.of_agent(self.agent).items() if k in looked_at}

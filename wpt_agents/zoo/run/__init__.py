@@ -1,1 +1,1 @@
-"""Doing runs: stages, checkpoints, engines."""
+"""Execution of runs: stages, checkpoints, engines."""

@@ -1,11 +1,10 @@
-"""Where a run stands, so that the same command resumes it whatever ended the process.
+"""Checkpoints, from which the same command resumes an interrupted run.
 
 A checkpoint is a folder `checkpoints/step-N`: model file, logs so far, and `state.json` with the
-checksum of every other file. It is written aside and renamed, so it is complete or not there; the
-last two are kept. Episodes stand beside in `replay/`, one file per episode. Checkpoints are taken
-between two episodes, and everything that is drawn depends on counters alone, so a resumed run
-equals one that was never interrupted, bit for bit on a CPU. Whatever came after the checkpoint is
-discarded.
+checksum of every other file. It is written to a temporary folder and renamed, so it is never
+incomplete; the last two are kept. Episodes are stored in `replay/`, one file per episode.
+Checkpoints are taken between episodes, and random numbers depend only on counters, so a resumed run
+equals an uninterrupted one, bit for bit on a CPU. Everything after the checkpoint is discarded.
 """
 
 import hashlib
@@ -34,18 +33,18 @@ STATE = "state.json"
 
 
 def resumes(agent: BaseAlgorithm) -> bool:
-    """Return whether checkpoints can hold all of the agent: it keeps whole episodes, as WPT."""
+    """Return whether checkpoints can contain the whole agent, because it stores whole episodes."""
     buffer = getattr(agent, "replay_buffer", None)
     return isinstance(buffer, ReplayBuffer) and hasattr(agent, "episodes")
 
 
 @dataclass(frozen=True)
 class State:
-    """What `state.json` holds: everything beside the model file, the logs and the episodes.
+    """The content of `state.json`: all state besides the model file, the logs and the episodes.
 
     :param seconds: wall-clock seconds of learning so far
     :param replay: the number of episodes in the replay buffer
-    :param log: the means that were being logged
+    :param log: the running means of the logger
     :param ep_info: SB3's information on the latest episodes
     :param files: the checksum of every file of the checkpoint
     :param cpu_seconds: processor seconds of learning so far; 0 in checkpoints of version 0.1
@@ -78,9 +77,9 @@ class Checkpoint:
         return self.folder / "model.zip"
 
     def check(self, run: Path) -> None:
-        """Check that every file is there and unchanged.
+        """Check that every file exists and is unchanged.
 
-        :raises ValueError: one is not
+        :raises ValueError: if one does not or has changed
         """
         for name, checksum in self.state.files.items():
             if _checksum(self.folder / name) != checksum:
@@ -90,14 +89,14 @@ class Checkpoint:
                 raise ValueError(f"{_episode(run, i).name} is missing")
 
     def restore_logs(self, run: Path) -> None:
-        """Replace the run's logs by those of the checkpoint."""
+        """Replace the run's logs with those of the checkpoint."""
         for name in LOGS:
             (run / name).unlink(missing_ok=True)
             if name in self.state.files:
                 shutil.copy2(self.folder / name, run / name)
 
     def restore(self, agent: Any, run: Path) -> None:
-        """Restore what the model file does not hold: the episodes, and the means being logged.
+        """Restore the episodes and the logger's means, which the model file does not contain.
 
         :param agent: one that `resumes`
         """
@@ -115,7 +114,7 @@ class Checkpoint:
 
 
 def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
-    """Write where the agent stands into the run's folder; no episode may be open.
+    """Write a checkpoint into the run's folder; no episode may be in progress.
 
     :param agent: one that `resumes`
     :param seconds: wall-clock seconds of learning so far
@@ -153,7 +152,7 @@ def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: f
 
 
 def _write_episodes(agent: Any, run: Path) -> None:
-    """Write the episodes of the replay buffer that have no file yet."""
+    """Write the replay buffer's episodes that have no file yet."""
     for i, trajectory in enumerate(agent.replay_buffer.trajectories):
         if not _episode(run, i).exists():
             one = ReplayBuffer()
@@ -174,13 +173,13 @@ def last_checkpoint(run: Path) -> Checkpoint | None:
 
 
 def remove_checkpoints(run: Path) -> None:
-    """Free the disk when a run is finished, or before a new one begins."""
+    """Delete all checkpoints when a run is finished, or before a new one starts."""
     for name in ("checkpoints", "replay"):
         shutil.rmtree(run / name, ignore_errors=True)
 
 
 def _folders(run: Path) -> list[Path]:
-    """The checkpoints' folders, newest first."""
+    """Return the checkpoints' folders, newest first."""
     return sorted((run / "checkpoints").glob("step-*"), reverse=True)
 
 
@@ -194,11 +193,11 @@ def _checksum(path: Path) -> str:
 
 
 class Checkpoints(BaseCallback):
-    """Writes a checkpoint every few steps, between two episodes, and at the end of learning.
+    """Write a checkpoint every few steps, between episodes, and at the end of learning.
 
-    It also measures what learning costs, over all processes that took part in it in turn.
+    It also measures the cost of learning over all processes that took part.
 
-    :param every: steps; 0 for at the end only, None for never
+    :param every: steps between checkpoints; 0: only at the end, None: never
     :param seconds: wall-clock seconds of learning in earlier processes
     :param cpu_seconds: processor seconds of learning in earlier processes
     """
@@ -220,7 +219,7 @@ class Checkpoints(BaseCallback):
 
     @property
     def cpu_seconds(self) -> float:
-        """Processor seconds of the learning processes, all their threads."""
+        """CPU seconds of the learning processes, all their threads."""
         return time.process_time() - self.cpu_start
 
     def _on_training_start(self) -> None:
@@ -228,7 +227,7 @@ class Checkpoints(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         starts = self.model._last_episode_starts
-        between = starts is not None and starts.all()  # not after a part of a long episode
+        between = starts is not None and starts.all()  # but not within a long episode
         if self.every and between and self.model.num_timesteps - self.written >= self.every:
             write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
             self.written = self.model.num_timesteps
@@ -237,16 +236,16 @@ class Checkpoints(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        interrupted = self.model._last_obs is None  # by an error, in the middle of an episode
+        interrupted = self.model._last_obs is None  # stopped by an error within an episode
         new = self.model.num_timesteps > self.written
         if self.every is not None and new and not interrupted:
             write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
 
 
 class HeadStart(BaseCallback):
-    """Saves the agent when the head start of its fine-tuning ends: after `actor_delay` updates.
+    """Save the agent at the end of the head start of fine-tuning: after `actor_delay` updates.
 
-    Agents without a head start have no such keyword, or 0.
+    Agents without a head start lack this keyword or have the value 0.
     """
 
     def __init__(self, run: Path) -> None:

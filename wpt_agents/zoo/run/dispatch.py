@@ -1,4 +1,4 @@
-"""A plan is shown, or checked and done: here, or on an engine."""
+"""Show a plan, or check and execute it, here or on an engine."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from wpt_agents.zoo.run.sequences import run_sequences
 
 
 def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
-    """Refuse, before anything is done, what this machine, its disk or the folders do not allow."""
+    """Raise an error in advance if machine, disk or folders do not allow the plan."""
     check_machine(engine, runs[0].device)
     check_space(runs)
     for run in runs:
@@ -24,16 +24,16 @@ def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
 
 
 def preview(runs: Sequence[Run], engine: str, force: bool) -> None:
-    """Print what would be done, then end in what would be refused."""
+    """Print the plan, then raise the errors that running it would raise."""
     show_plan(runs, force)
     typer.echo(summary(runs, force))
     check_plan(runs, engine, force)
 
 
 def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources) -> bool:
-    """Check the runs, then do them.
+    """Check the runs, then execute them.
 
-    :return: whether all are finished
+    :return: True if all are finished
     """
     check_plan(runs, engine, force)
     if engine == "none":
@@ -43,9 +43,9 @@ def do_plan(runs: Sequence[Run], engine: str, force: bool, resources: Resources)
 
 
 def do_sequences(jobs: Sequence[SequenceRun], force: bool, dry_run: bool) -> bool:
-    """Check the sequences, then do them; with `dry_run`, only show them.
+    """Check the sequences, then execute them; with `dry_run`, only show them.
 
-    :return: whether all are finished, or shown
+    :return: True if all are finished, or shown
     """
     runs = [run for job in jobs for run in job.runs]
     if dry_run:

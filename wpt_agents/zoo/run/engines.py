@@ -1,8 +1,8 @@
 """Engines: runs in processes of their own, on a Ray cluster, or as Slurm jobs.
 
-All engines do the same: first what runs share (data, pre-trained model), then one job per run,
-which resumes from its last checkpoint if its worker died before. The folders are the same, too, and
-must be on a file system that all machines see. Ray and submitit are imported only when needed.
+All engines first execute the shared stages (data, pre-trained model), then one job per run, which
+resumes from its last checkpoint if its worker died. They use the same folders, which must be on a
+file system that all machines share. Ray and submitit are imported only when needed.
 """
 
 import shutil
@@ -32,17 +32,17 @@ from wpt_agents.zoo.run.watch import shown
 from wpt_agents.zoo.terminal import console, logged, say
 
 Work = Callable[[Run], None]
-Tick = Callable[[], None]  # called repeatedly while waiting; takes a moment
+Tick = Callable[[], None]  # called repeatedly while waiting; should be fast
 Errors = dict[Path, str]  # by run folder, of the runs that failed
 
 
 @dataclass(frozen=True)
 class Resources:
-    """The resources of one job, and how often it is begun again when its worker dies.
+    """The resources of one job, and the number of retries if its worker dies.
 
-    :param hours: the time after which Slurm ends a job; it is then sent again and resumes
+    :param hours: the time limit of a Slurm job, after which it is resubmitted and resumes
     :param address: the address of the Ray cluster; "" starts one on this machine
-    :param partition: the partition of Slurm; "local" does the jobs on this machine without Slurm
+    :param partition: the Slurm partition; "local" executes the jobs on this machine without Slurm
     """
 
     workers: int = 2
@@ -56,9 +56,9 @@ class Resources:
 
 
 def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) -> bool:
-    """Do the runs on an engine and show their progress.
+    """Execute the runs on an engine and show their progress.
 
-    :return: whether all are finished
+    :return: True if all are finished
     """
     check_machine(engine, jobs[0].device)
     jobs = [_at_absolute_paths(job) for job in jobs]
@@ -84,7 +84,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
 
 
 def clear_all(folders: Sequence[Path]) -> None:
-    """Clear the folders, or none of them if another process works on one."""
+    """Clear the folders, or none of them if another process is using one."""
     with ExitStack() as locks:
         for folder in folders:  # all of them, before anything is deleted
             locks.enter_context(locked(folder / "lock"))
@@ -98,7 +98,7 @@ def _at_absolute_paths(job: Run) -> Run:
 
 
 def make_shared(job: Run) -> None:
-    """Do the work of a job: make what `job` shares with other runs."""
+    """Execute the shared stages of `job`."""
     with logged(job.out / "cache" / "log.txt"):
         dataset = collect_data(job.shared)
         if job.algorithm.pretrained:
@@ -106,19 +106,19 @@ def make_shared(job: Run) -> None:
 
 
 def do(job: Run) -> None:
-    """Do the work of a job: the run, with its output in the folder's `log.txt`."""
+    """Execute the run of a job, with its output in the folder's `log.txt`."""
     with logged(job.folder / "log.txt"):
         runner.run(job)
 
 
 class Local:
-    """`workers` processes at a time, one for each run."""
+    """The engine with `workers` simultaneous processes, one for each run."""
 
     def __init__(self, resources: Resources) -> None:
         self.resources = resources
 
     def map(self, work: Work, jobs: Sequence[Run], tick: Tick) -> Errors:
-        """Do the work of each job; a job whose process is killed resumes in another.
+        """Execute the jobs; a job whose process is killed resumes in a new one.
 
         :return: the errors of the jobs that failed
         """
@@ -146,8 +146,8 @@ class Local:
         return errors
 
     def start(self, work: Work, job: Run) -> BaseProcess:
-        """Start a new process, so that no run inherits another's state."""
-        context = get_context("forkserver")  # imports once what every run needs
+        """Start a new process, so that runs do not share any state."""
+        context = get_context("forkserver")  # imports the modules of all runs once
         context.set_forkserver_preload([runner.__name__])
         process = context.Process(target=_in_child, args=(work, job, self.resources.cpus))
         process.start()
@@ -177,7 +177,7 @@ def why(job: Run, code: int) -> str:
 
 
 class Ray:
-    """One task of a Ray cluster for each run; Ray begins it again when its worker dies."""
+    """The engine with a Ray task for each run, which Ray restarts if its worker dies."""
 
     def __init__(self, resources: Resources) -> None:
         self.resources = resources
@@ -218,7 +218,7 @@ class Ray:
         return errors
 
     def check_resources(self) -> None:
-        """Refuse to wait for resources that the cluster does not have."""
+        """Raise an error if the cluster does not have the requested resources."""
         cluster = self.ray.cluster_resources()
         resources = self.resources
         memory = resources.memory_gb * 2**30
@@ -231,7 +231,7 @@ class Ray:
 
 
 class Slurm:
-    """One Slurm job for each run, through submitit; it is sent again when it is preempted."""
+    """The engine with a Slurm job for each run (submitit), which is resubmitted if preempted."""
 
     def __init__(self, resources: Resources) -> None:
         self.resources = resources
@@ -276,7 +276,7 @@ class Slurm:
 
 @dataclass(frozen=True)
 class Preemptible:
-    """A job's work that Slurm may end; submitit then sends it again, from its last checkpoint."""
+    """A job that submitit resubmits if Slurm ends it, to resume from its last checkpoint."""
 
     work: Work
     cpus: int = 1
@@ -286,6 +286,6 @@ class Preemptible:
         _in_process(self.work, job, self.cpus)
 
     def checkpoint(self, job: Run) -> Any:
-        """Return what submitit sends again after a preemption."""
+        """Return the job to resubmit after a preemption."""
         submitit = import_extra("submitit", "slurm")
         return submitit.helpers.DelayedSubmission(self, job)

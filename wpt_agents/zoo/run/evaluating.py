@@ -1,4 +1,4 @@
-"""Stage 5 of a run: the scores of all its policies, and pictures of the one that counts."""
+"""Stage 5 of a run: the scores of all its policies, and pictures of the final one."""
 
 import hashlib
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ from wpt_agents.zoo.run.shared import play_untrained
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import say
 
-CONTEXT = 5  # images that the world model sees before it predicts
-HORIZON = 40  # images that it then predicts
+CONTEXT = 5  # number of images that the world model observes
+HORIZON = 40  # number of images that it then predicts
 
 
 def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:
-    """Stage 5: the scores of every policy of the run, from the same initial states."""
+    """Stage 5: score every policy of the run, from the same initial states."""
     episodes = run.preset.evaluate.episodes
     seed = run.evaluation_seed
     say("evaluate", f"{counted(episodes, 'episode')} of each policy, from the same initial states")
@@ -38,7 +38,7 @@ def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:
 
 
 def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
-    """Return the policies that the run has trained, by name."""
+    """Return the trained policies of the run, by name."""
     prior: PolicyPredictor | None = getattr(agent, "prior", None)
     trained = {PRIOR_ACTOR: prior} if prior is not None else {}
     for name, file in ((HEAD_START, HEAD_START_MODEL), (BEST, BEST_MODEL)):
@@ -50,13 +50,13 @@ def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
 
 
 def final_agent(run: Run, agent: BaseAlgorithm) -> BaseAlgorithm:
-    """Return the agent that counts: the best one if the run kept it, else the last."""
+    """Return the final agent: the best one if it was kept, else the last."""
     best = run.folder / BEST_MODEL
     return run.algorithm.agent.load(best, device=run.device) if best.exists() else agent
 
 
 def final_model(folder: Path) -> Path:
-    """Return the model file that counts: the best one if the run kept it, else the last."""
+    """Return the final model file: the best one if it was kept, else the last."""
     best = folder / BEST_MODEL
     return best if best.exists() else folder / "model.zip"
 
@@ -68,7 +68,7 @@ def file_hash(path: Path) -> str:
 
 
 def draw(run: Run, agent: BaseAlgorithm, scores: Mapping[str, Score]) -> None:
-    """Draw the learning curve, film the policy that counts, and draw what its model predicts."""
+    """Draw the learning curve and the model's predictions, and film the final policy."""
     say("pictures", "learning_curve.png, policy.mp4, predictions.png")
     title = f"{short_name(run.task)}, {run.method}, preset {run.preset_name}, seed {run.seed}"
     _draw_curve(run, title, scores)

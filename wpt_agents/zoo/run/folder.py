@@ -1,4 +1,4 @@
-"""The folder of a run: whose settings it holds, and how it is cleared."""
+"""The folder of a run: check its settings, and clear it."""
 
 import json
 import shutil

@@ -32,15 +32,15 @@ from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.tasks import metric_of, name_in_data, short_name
 from wpt_agents.zoo.terminal import say
 
-APART = 10_000  # between the seeds of the evaluations during fine-tuning and of those at its end
+APART = 10_000  # offset between the seeds of evaluations during and after fine-tuning
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What learning cost, in all processes that took part in it one after the other.
+    """The cost of learning, over all successive processes.
 
-    :param seconds: of wall-clock
-    :param cpu_seconds: of processor time of the learner's process, all its threads
+    :param seconds: wall-clock time
+    :param cpu_seconds: CPU time of the learner's process, all its threads
     """
 
     seconds: float
@@ -48,7 +48,7 @@ class Effort:
 
 
 def make_training_env(run: Run) -> VecEnv:
-    """Make the task to learn, in a process of its own where updates are made while it steps."""
+    """Make the task to learn, in its own process if updates are made while it steps."""
     overlap = run.preset.learn.overlap and run.keywords.get("train_freq") == "step"
     monitor = str(run.folder / MONITOR)
     venv = make_vec_env(run.task.id, run.shared.env, run.seed, monitor=monitor, workers=overlap)
@@ -69,7 +69,7 @@ def make_agent(
         agent = without_progress_bar(run.algorithm.agent)
         return agent(run.algorithm.policy, venv, **_keywords(run, dataset))
     model: Any = load_agent(run, venv, dataset, start)
-    model.reset_task()  # heads, actor and critic are drawn by this run's seed, not pre-training's
+    model.reset_task()  # heads, actor and critic are initialised with the seed of this run
     return model
 
 
@@ -88,14 +88,14 @@ def _keywords(run: Run, dataset: TrajectoryDataset | None) -> dict[str, Any]:
         "episode_length": episode_steps(run.task.id, run.shared.env),
     }
     known = {name: value for name, value in task.items() if run.algorithm.takes(name)}
-    specific = deepcopy(run.keywords)  # SB3's agents write into `policy_kwargs`
+    specific = deepcopy(run.keywords)  # SB3's agents modify `policy_kwargs`
     if dataset is not None and run.algorithm.takes("task"):
         specific.setdefault("task", name_in_data(run.task, dataset.tasks))
     return {"seed": run.seed, "device": run.device, **specific, **known}
 
 
 def without_progress_bar(agent: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """Return the class without SB3's progress bar: the runner's stands among the callbacks."""
+    """Return the class without SB3's progress bar, because the runner has its own callback."""
 
     def init_callback(
         self: BaseAlgorithm, callback: MaybeCallback, progress_bar: bool = False
@@ -106,7 +106,7 @@ def without_progress_bar(agent: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
 
 
 def build_index(run: Run, agent: BaseAlgorithm) -> None:
-    """Stage 3: the features of every first image, kept beside the dataset; a picture of it."""
+    """Stage 3: index the features of every first image, stored beside the dataset; draw a sheet."""
     if not isinstance(agent, WPT) or agent.dataset is None:
         return
     folder = Path(agent.dataset.path)
@@ -122,7 +122,7 @@ def build_index(run: Run, agent: BaseAlgorithm) -> None:
 
 
 def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effort:
-    """Stage 4: fine-tuning, with evaluations during it where the preset asks for them."""
+    """Stage 4: fine-tuning, with evaluations if the preset requests them."""
     repeat = run.preset.env.action_repeat
     steps = run.preset.steps
     done = agent.num_timesteps * repeat
@@ -153,7 +153,7 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effo
 
 
 def resume(run: Run, agent: Any, checkpoint: Checkpoint) -> None:
-    """Restore what the model file does not hold, in the agent and in its environment."""
+    """Restore the state of agent and environment that the model file does not contain."""
     checkpoint.restore(agent, run.folder)
     go_to_episode(agent.env, first_episode(agent) + agent.episodes)
 
@@ -161,7 +161,7 @@ def resume(run: Run, agent: Any, checkpoint: Checkpoint) -> None:
 def first_episode(agent: Any) -> int:
     """Return the number of the first episode that was collected for the task.
 
-    Those before it were only begun, for the first images that retrieval compares.
+    Earlier ones were only started, for the first images that retrieval compares.
     """
     looked = isinstance(agent, WPT) and agent.progress.retrieved_ids
     return agent.retrieval_images - 1 if looked else 0
@@ -169,7 +169,7 @@ def first_episode(agent: Any) -> int:
 
 @contextmanager
 def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
-    """Open the callback that evaluates every `evaluate.every` frames, into `evaluations.npz`."""
+    """Make the callback that evaluates every `evaluate.every` frames, into `evaluations.npz`."""
     settings = run.preset.evaluate
     if not settings.every:
         yield []

@@ -1,4 +1,4 @@
-"""Locks on folders that several processes write to, and files that are written as a whole."""
+"""Locks on folders that several processes write to, and atomic JSON files."""
 
 import fcntl
 import json
@@ -10,15 +10,15 @@ from typing import IO, Any
 
 from wpt_agents.files.archive import replacing
 
-PATIENCE = 0.5  # seconds to wait for a lock: `zoo watch` takes each one for an instant
+PATIENCE = 0.5  # seconds to wait for a lock, because `zoo watch` acquires each one briefly
 
 
 @contextmanager
 def locked(path: Path, wait: bool = False) -> Iterator[None]:
-    """Keeps other processes out while the block runs; the lock ends with its process.
+    """Lock out other processes during the block; the lock ends with its process.
 
-    :param path: a file that stands for what is locked
-    :param wait: until it is free, instead of refusing after `PATIENCE`
+    :param path: the lock file
+    :param wait: wait until it is free, instead of raising an error after `PATIENCE` seconds
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", encoding="utf-8") as file:
@@ -42,6 +42,6 @@ def _taken(file: IO[str], wait: bool) -> bool:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` to `path`, whole or not at all."""
+    """Write `value` to `path` atomically."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")

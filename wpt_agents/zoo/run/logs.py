@@ -13,14 +13,13 @@ from wpt_agents.zoo.result import Metric
 
 
 class Evaluations(EvalCallback):
-    """SB3's EvalCallback, which continues the evaluations of its folder and the best of them.
+    """SB3's EvalCallback, which continues the evaluations in its folder.
 
-    The best policy is the one of the highest mean return, or where the task's score is its success
-    rate, of the most successes, and among equal ones of the highest return. The first of equals is
-    kept.
+    The best policy is the one with the highest mean return; if the task's metric is success, the
+    one with the highest success rate, then the highest return. The first of equal ones is kept.
 
     :param metric: the task's, "return" or "success"
-    :param keep: the file that the best model is written to; None for no such file
+    :param keep: the file for the best model; None: do not save it
     """
 
     def __init__(
@@ -32,7 +31,7 @@ class Evaluations(EvalCallback):
 
     @property
     def scores(self) -> list[tuple[float, ...]]:
-        """What each evaluation so far is judged by; the larger, the better."""
+        """Return the criterion of each evaluation so far; larger is better."""
         returns = [float(np.mean(episodes)) for episodes in self.evaluations_results]
         if self.metric == "return":
             return [(value,) for value in returns]
@@ -60,7 +59,7 @@ class Evaluations(EvalCallback):
         return super()._on_step()
 
     def _evaluated(self) -> bool:
-        """Evaluate and replace `evaluations.npz` whole; SB3 would write into it in place."""
+        """Evaluate and replace `evaluations.npz` atomically; SB3 would write it in place."""
         assert self.log_path is not None
         path = Path(f"{self.log_path}.npz")
         aside = path.with_name(f".{path.name}")
@@ -77,5 +76,5 @@ class Evaluations(EvalCallback):
 
 
 def go_to_episode(venv: VecEnv, number: int) -> None:
-    """The next reset of environments under `EpisodeSeeds` begins episode `number`."""
+    """Make the next reset of environments in `EpisodeSeeds` start episode `number`."""
     venv.env_method("go_to_episode", number)

@@ -1,4 +1,4 @@
-"""The runner's progress bar: how much, how fast, and the time left."""
+"""The runner's progress bar with speed and remaining time."""
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -8,10 +8,10 @@ from wpt_agents.zoo.terminal import progress
 
 
 class LearningBar(BaseCallback):
-    """Fine-tuning's bar. It moves once an episode, after the episode's updates have been made.
+    """The progress bar of fine-tuning, which advances once per episode, after its updates.
 
-    Steps are quick and updates come in bursts, so a bar that moves with every step, as SB3's does,
-    misjudges the time left.
+    Steps are fast and updates come in bursts, so a bar that advances with every step, as SB3's
+    does, gives wrong estimates of the remaining time.
     """
 
     def __init__(self, frames_a_step: int) -> None:
@@ -20,7 +20,7 @@ class LearningBar(BaseCallback):
         self.bar: tqdm[None] | None = None
 
     def _on_rollout_start(self) -> None:
-        if self.bar is None:  # not sooner: retrieval and cloning have bars of their own
+        if self.bar is None:  # after retrieval and imitation, which have their own bars
             total = self.locals["total_timesteps"] * self.frames_a_step
             done = self.model.num_timesteps * self.frames_a_step
             self.bar = progress(total, "learn", "frames", done)

@@ -1,7 +1,7 @@
-"""One task, method and seed: one run folder, with everything that was done and found.
+"""Execute runs: one task, method and seed per run folder, with all settings and results.
 
 A run collects, pre-trains, indexes, fine-tunes and evaluates: five stages, each a function of its
-inputs. `result.json` is written last: where it exists, the run is finished.
+inputs. `result.json` is written last: if it exists, the run is finished.
 """
 
 import time
@@ -30,7 +30,7 @@ from wpt_agents.zoo.terminal import console, say
 
 
 def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
-    """Do the runs one after the other; a run that fails is reported and does not stop the rest.
+    """Execute the runs in turn; a failed run is reported and does not stop the others.
 
     :param force: whether to replace finished runs
     :return: whether all are finished
@@ -41,7 +41,7 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
         say(f"run {number}/{len(jobs)}", job.title)
         try:
             done = run(job, force)
-        except Exception as error:  # whatever one run dies of, the others are not to blame
+        except Exception as error:  # any failure of one run must not stop the others
             console.print(f"[red]failed[/red]: {escape(str(error))}")
             if (trace := job.folder / "error.txt").exists():
                 console.print(f"Traceback: {escape(str(trace))}")
@@ -56,7 +56,7 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
 
 
 def run(job: Run, force: bool = False) -> Result:
-    """Do the stages of a run that are not finished, and return its result."""
+    """Execute the unfinished stages of a run, and return its result."""
     check_folder(job, force)
     done = None if force else read_result(job.folder)
     if done is not None:
@@ -70,7 +70,7 @@ def run(job: Run, force: bool = False) -> Result:
 
 
 def _begin(job: Run) -> Result:
-    """Write into the folder what is being done, then do it."""
+    """Write the configuration into the folder, then execute the run."""
     (job.folder / "error.txt").unlink(missing_ok=True)
     with replacing(job.folder / "config.yaml") as temporary:
         temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False), encoding="utf-8")
@@ -98,7 +98,7 @@ class Clock:
 
 
 def do_stages(job: Run) -> Result:
-    """Do the stages one after the other, fine-tuning from the last checkpoint if there is one."""
+    """Execute the stages in turn; fine-tuning resumes from the last checkpoint, if any."""
     clock = Clock()
     dataset = None
     start = None
@@ -113,7 +113,7 @@ def do_stages(job: Run) -> Result:
     prepare_logs(job, checkpoint)
     with closing(make_training_env(job)) as venv:
         agent = make_agent(job, venv, dataset, start, checkpoint)
-        if dataset is not None and checkpoint is None:  # a resumed run has retrieved already
+        if dataset is not None and checkpoint is None:  # a resumed run has already retrieved
             with clock("index"):
                 build_index(job, agent)
         effort = learn(job, agent, checkpoint)
@@ -130,7 +130,7 @@ def do_stages(job: Run) -> Result:
 
 
 def prepare_logs(job: Run, checkpoint: Checkpoint | None) -> None:
-    """Put the logs back to the checkpoint's state, or remove leftovers if there is none."""
+    """Restore the logs of the checkpoint, or delete old logs if there is none."""
     if checkpoint is not None:
         checkpoint.restore_logs(job.folder)
         return
@@ -147,7 +147,7 @@ def make_result(
     effort: Effort,
     start: Path | None,
 ) -> Result:
-    """Put together the result of a run."""
+    """Assemble the result of a run."""
     return Result(
         suite=job.task.suite,
         task=short_name(job.task),

@@ -1,9 +1,9 @@
-"""A sequence of tasks that one agent learns one after the other, resumable at any moment.
+"""Execute a sequence of tasks that one agent learns in turn; it can be resumed at any time.
 
 Each task has a folder with the logs, checkpoints and model file of an ordinary run, and with
-`scores.json` once it is finished. An agent goes on to the next task from files alone, so a sequence
-that was killed continues as one that never stopped. The episodes of all tasks are kept until the
-sequence ends. `sequence.json` holds the results of the tasks that are finished.
+`scores.json` once it is finished. An agent starts the next task from files alone, so a killed
+sequence resumes exactly. The episodes of all tasks are kept until the sequence ends.
+`sequence.json` contains the results of the finished tasks.
 """
 
 import shutil
@@ -56,7 +56,7 @@ from wpt_agents.zoo.terminal import console, say
 
 
 def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
-    """Do the sequences one after the other; one that fails is reported and stops no other.
+    """Execute the sequences in turn; a failed one is reported and does not stop the others.
 
     :param force: whether to replace finished sequences
     :return: whether all are finished
@@ -68,7 +68,7 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
         say(f"sequence {number}/{len(jobs)}", job.title)
         try:
             run_sequence(job, force)
-        except Exception as error:  # whatever one sequence dies of, the others are not to blame
+        except Exception as error:  # any failure of one sequence must not stop the others
             finished = False
             console.print(f"[red]failed[/red]: {escape(str(error))}")
             continue
@@ -77,7 +77,7 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
 
 
 def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
-    """Learn the tasks of a sequence that are not finished, and return its result."""
+    """Learn the unfinished tasks of a sequence, and return its result."""
     done = None if force else read_sequence(job.folder)
     if done is not None and done.finished:
         say("sequence", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")
@@ -133,7 +133,7 @@ def _result(job: SequenceRun, rows: Sequence[Row]) -> SequenceResult:
 
 
 def _learn_task(job: SequenceRun, number: int) -> Row:
-    """Learn one task, then play it and all before it."""
+    """Learn one task, then evaluate it and all earlier ones."""
     run = job.runs[number]
     run.folder.mkdir(parents=True, exist_ok=True)
     dataset = collect_data(run.shared) if run.algorithm.needs_data else None
@@ -171,7 +171,7 @@ def _begin(
     start: Path | None,
     checkpoint: Checkpoint | None,
 ) -> BaseAlgorithm:
-    """Return the agent of a task: as it was interrupted, or as the task before left it."""
+    """Return the agent of a task: from its checkpoint, or from the previous task."""
     run = job.runs[number]
     folders = _folders(job, number)
     if checkpoint is not None or number == 0:
@@ -182,7 +182,7 @@ def _begin(
     agent.replay_buffer = _episodes(folders[-1:])
     _keep(agent, folders[:-1])
     agent.next_task(venv)
-    go_to_episode(venv, agent.episodes)  # no initial state comes twice
+    go_to_episode(venv, agent.episodes)  # initial states do not repeat
     return agent
 
 
@@ -210,7 +210,7 @@ def _keep(agent: BaseAlgorithm, folders: Sequence[Path]) -> None:
 
 
 def policy_of(agent: BaseAlgorithm, task: int) -> PolicyPredictor:
-    """Return what acts on a task of the sequence: PackNet keeps a policy for each of them."""
+    """Return the policy for a task of the sequence; PackNet has one for each task."""
     return agent.policy_of(task) if isinstance(agent, PackNet) else agent
 
 

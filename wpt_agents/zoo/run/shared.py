@@ -1,6 +1,6 @@
 """The stages that runs share: data, pre-trained model, and the scores of untrained policies.
 
-Each is made once and reused by later runs; a half-finished one is continued.
+Each is executed once and reused by later runs; an unfinished one is continued.
 """
 
 import json
@@ -28,7 +28,7 @@ from wpt_agents.zoo.terminal import say
 
 
 def collect_data(shared: Shared) -> TrajectoryDataset:
-    """Stage 1: the dataset, collected unless it is complete already."""
+    """Stage 1: collect the dataset, unless it is complete."""
     if shared.given_data is not None:
         dataset = TrajectoryDataset.open(shared.given_data)
         size = counted(len(dataset), "episode")
@@ -47,7 +47,7 @@ def _collected(shared: Shared) -> TrajectoryDataset:
             TrajectoryDataset.open(shared.data_path).appended if shared.data_path.exists() else 0
         )
     except ValueError:
-        stored = 0  # `collect` says what is wrong
+        stored = 0  # `collect` raises the error
     state = "reused" if stored == total else f"continued at {stored} of" if stored else "making"
     names = ", ".join(settings.tasks) or f"all tasks of {shared.suite}"
     episodes = counted(total, "reward-free episode")
@@ -64,7 +64,7 @@ def _collected(shared: Shared) -> TrajectoryDataset:
 
 
 def _warn_of_differences(shared: Shared) -> None:
-    """Warn of data that `collect` recorded in another environment than the task's."""
+    """Warn about data that `collect` recorded with other environment settings than the task's."""
     label = shared.data_path / "collect.json"
     recorded: dict[str, Any] = (
         json.loads(label.read_text(encoding="utf-8"))["env"] if label.exists() else {}
@@ -76,7 +76,7 @@ def _warn_of_differences(shared: Shared) -> None:
 
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
-    """Stage 2: the file of the pre-trained model, which is pre-trained unless it is finished."""
+    """Stage 2: pre-train the model unless it is finished, and return its file."""
     if name := shared.preset.pretrain.model:
         say("pretrain", f"the shipped model {name}  [dim]{shipped_model(name)}")
         return shipped_model(name)
@@ -120,7 +120,7 @@ def _pretrain(shared: Shared, dataset: TrajectoryDataset) -> None:
 
 
 def play_untrained(shared: Shared, name: str, task: Task, seed: int) -> Score:
-    """Return the score of an untrained policy on a task, played unless it is known already."""
+    """Return the score of an untrained policy on a task, evaluated unless it is cached."""
     episodes = shared.preset.evaluate.episodes
     path = shared.cache / f"{name}-{key(task.id, shared.env, episodes, seed)}.json"
     if (known := read_score(path)) is not None:

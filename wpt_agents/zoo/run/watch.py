@@ -1,4 +1,4 @@
-"""What the runs of a plan are at, one line each, read from their folders alone."""
+"""The progress of the runs of a plan, one line each, read from their folders."""
 
 import fcntl
 import time
@@ -17,17 +17,17 @@ from wpt_agents.zoo.report.tables import number
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 
-RECENT = 10  # episodes that return and speed are taken over
+RECENT = 10  # number of episodes for the means of return and speed
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a run stands.
+    """The progress of a run.
 
     :param state: "waiting", "preparing", "learning", "evaluating", "stopped", "failed", "finished"
     :param steps: calls of `env.step` so far
     :param mean_return: of the last episodes
-    :param speed: calls of `env.step` a second, updates included
+    :param speed: calls of `env.step` per second, including updates
     """
 
     state: str
@@ -37,7 +37,7 @@ class Standing:
 
 
 def standing(job: Run) -> Standing:
-    """Reads a run's folder; nothing is written, and the run may be on another machine."""
+    """Read a run's folder without writing; the run may be on another machine."""
     folder = job.folder
     played = TrainingEpisodes.read(folder / MONITOR)
     steps = int(played.lengths.sum())
@@ -57,8 +57,8 @@ def standing(job: Run) -> Standing:
 
 
 def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
-    """Steps a second over the last episodes since the process began; None with fewer than two."""
-    begins = np.flatnonzero(np.diff(times) < 0)  # the clock of a resumed run begins at 0
+    """Return the steps per second over the last episodes of the process, None for fewer than 2."""
+    begins = np.flatnonzero(np.diff(times) < 0)  # the clock of a resumed run restarts at 0
     since = max(begins[-1] + 1 if len(begins) else 0, len(times) - RECENT)
     lengths, times = lengths[since:], times[since:]
     if len(times) < 2 or times[-1] <= times[0]:
@@ -67,7 +67,7 @@ def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process works on the run; seen on other machines where the file system locks."""
+    """Return whether a process works on the run, on any machine if the file system has locks."""
     path = folder / "lock"
     if not path.exists():
         return False
@@ -80,7 +80,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def overview(jobs: Sequence[Run]) -> Table:
-    """One line a run: progress, return, speed, time left."""
+    """Return a table with a line per run: progress, return, speed, remaining time."""
     table = Table("task", "method", "seed", "state")
     for heading in ("frames", "done", "return", "steps/s", "time left"):
         table.add_column(heading, justify="right")
@@ -106,7 +106,7 @@ def clock(seconds: float) -> str:
 
 @contextmanager
 def shown(jobs: Sequence[Run], every: float = 1.0) -> Iterator[Callable[[], None]]:
-    """Keeps `overview` on the terminal; what it yields waits a moment and renews it."""
+    """Keep `overview` on the terminal; yield a function that waits briefly and updates it."""
     with Live(overview(jobs), console=console, auto_refresh=False) as live:
 
         def tick() -> None:
@@ -118,7 +118,7 @@ def shown(jobs: Sequence[Run], every: float = 1.0) -> Iterator[Callable[[], None
 
 
 def watch(jobs: Sequence[Run]) -> None:
-    """Shows `overview` until every run is finished or has failed; only looks."""
+    """Show `overview` until every run is finished or has failed, without side effects."""
     with shown(jobs) as tick:
         while not all(standing(job).state in ("finished", "failed") for job in jobs):
             tick()

@@ -8,6 +8,7 @@ import json
 import os
 import socket
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,6 +17,9 @@ from typing import IO, Any
 import numpy as np
 
 VERSION = 1  # increased when the layout changes, so that older versions reject new files
+# What zipfile, zlib, json and NumPy raise on damaged files.
+FAULTS: tuple[type[Exception], ...] = (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError)
+FAULTS += (RuntimeError, TypeError, ValueError)
 
 
 @contextmanager
@@ -96,21 +100,26 @@ def load_arrays(
 
     :raises ValueError: if the file is truncated, damaged, of another kind or of a newer version
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            header = json.loads(archive.read("about.json"))
-            if header["kind"] != kind or header["version"] > VERSION:
-                raise ValueError(f"it holds a {header['kind']} of version {header['version']}")
-            arrays = {}
-            for name in archive.namelist():
-                if name.endswith(".npy"):
-                    with archive.open(name) as member:
-                        arrays[name[:-4]] = _read_array(member)
-    except (zipfile.BadZipFile, KeyError, EOFError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is damaged or not a {kind} of version {VERSION} ({error}); make it again"
-        ) from error
-    return header, arrays
+    with open(path, "rb") as file:
+        try:
+            return _read_arrays(file, kind)
+        except FAULTS as error:
+            raise ValueError(
+                f"{path} is damaged or not a {kind} of version {VERSION} ({error}); make it again"
+            ) from error
+
+
+def _read_arrays(file: IO[bytes], kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    with zipfile.ZipFile(file) as archive:
+        header = json.loads(archive.read("about.json"))
+        if header["kind"] != kind or header["version"] > VERSION:
+            raise ValueError(f"it holds a {header['kind']} of version {header['version']}")
+        arrays = {}
+        for name in archive.namelist():
+            if name.endswith(".npy"):
+                with archive.open(name) as member:
+                    arrays[name[:-4]] = _read_array(member)
+        return header, arrays
 
 
 def _read_array(file: IO[bytes]) -> np.ndarray:

@@ -1,0 +1,30 @@
+"""Archives of arrays that were damaged on the disk."""
+
+import numpy as np
+import pytest
+
+from wpt_agents.files.archive import load_arrays, save_arrays
+
+FLAGS = 8  # the places of fields in an entry of the zip's central directory
+METHOD = 10
+OFFSET = 42
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [(FLAGS, 1), (METHOD, 8), (METHOD, 99), (OFFSET + 3, 0xFF)],
+    ids=["encrypted", "compressed", "unknown compression", "out of the file"],
+)
+def test_a_damaged_directory_is_a_value_error(field, value, tmp_path):
+    path = tmp_path / "arrays"
+    save_arrays(path, "Test", {}, {"a": np.full(50, 0xFF, np.uint8)})
+    content = bytearray(path.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + field] = value
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="arrays is damaged or not a Test"):
+        load_arrays(path, "Test")
+
+
+def test_a_missing_file_is_not_called_damaged(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_arrays(tmp_path / "arrays", "Test")

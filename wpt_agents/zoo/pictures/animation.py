@@ -1,4 +1,4 @@
-"""A GIF of an episode beside true and dreamed images, for pages that show no videos."""
+"""A GIF of an episode with true and imagined images, for pages that do not show videos."""
 
 import os
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wpt_agents.zoo.pictures.runs import INK
 
-SHOTS = 50  # pictures in a GIF, at most: each costs 10 to 25 kB
-SLOWDOWN = 2  # it plays at half speed, because episodes of Meta-World last 2.5 seconds
-LAST = 2500  # milliseconds for which the last picture stays
-COLUMNS = 4  # pairs of a true and a dreamed image
+SHOTS = 50  # maximum number of frames in a GIF, of 10 to 25 kB each
+SLOWDOWN = 2  # half speed, because episodes of Meta-World last only 2.5 seconds
+LAST = 2500  # duration of the last frame in milliseconds
+COLUMNS = 4  # pairs of a true and an imagined image
 GAP = 4  # pixels between images
-BAND = 20  # pixels of a row or column of text
+BAND = 20  # size of a row or column of text in pixels
 COLOURS = 128
 
 
@@ -26,12 +26,12 @@ def animate(
     dreamed: np.ndarray | None = None,
     context: int = 0,
 ) -> None:
-    """Write a GIF of an episode, and beside it a strip of true above dreamed images.
+    """Write a GIF of an episode with a strip of true images above imagined ones.
 
-    Each pair of the strip plays until the step that is written above it, and then stays.
+    Each pair of the strip plays until the step in its label, and then stops.
 
-    :param shots: the film, each (S, S, 3) uint8
-    :param fps: frames per second of the film in real time
+    :param shots: the frames of the video, each (S, S, 3) uint8
+    :param fps: frames per second in real time
     :param true: (T, 64, 64, 3) uint8, the images that the agent observes
     :param dreamed: (T, 64, 64, 3) uint8, predicted from the first `context` of them
     """
@@ -42,7 +42,7 @@ def animate(
     else:
         assert true.shape == dreamed.shape, (true.shape, dreamed.shape)
         pictures = _compose(shots, steps, true, dreamed, context)
-    # One palette for all pictures, so that what does not move does not flicker.
+    # One palette for all frames, so that static parts do not flicker.
     samples = np.concatenate([np.asarray(picture)[::3, ::3] for picture in pictures])
     palette = Image.fromarray(samples).quantize(COLOURS)
     first, *others = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
@@ -58,7 +58,7 @@ def _compose(
     dreamed: np.ndarray,
     context: int,
 ) -> list[Image.Image]:
-    """Put the film and the strip side by side, for each of `steps`."""
+    """Combine the frames and the strip, for each of `steps`."""
     ends = np.linspace(context, len(true) - 1, COLUMNS + 1).round().astype(int).tolist()
     blank = _frame(shots[0].shape[0], [end - context + 1 for end in ends[1:]])
     film = shots[0].shape[0]
@@ -69,7 +69,7 @@ def _compose(
         picture.paste(Image.fromarray(shots[step]), (GAP, BAND))
         for column in range(COLUMNS):
             if column and step <= ends[column]:
-                break  # its turn has not come
+                break  # not started yet
             at = min(step, ends[column + 1])
             x = film + 2 * GAP + BAND + column * (size + GAP)
             for row, images in enumerate((true, dreamed)):
@@ -82,7 +82,7 @@ def _compose(
 def _frame(film: int, ahead: Sequence[int]) -> Image.Image:
     """Draw the empty strip with its labels.
 
-    :param ahead: how many steps each column's last image lies beyond the last observed one
+    :param ahead: number of steps from the last observed image to each column's last image
     """
     size = (film - GAP) // 2
     width = film + 2 * GAP + BAND + COLUMNS * (size + GAP)

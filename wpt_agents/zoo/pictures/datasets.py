@@ -1,4 +1,4 @@
-"""A look at the data: table and contact sheet of a dataset, and a sheet of what is retrieved."""
+"""The table and the contact sheet of a dataset."""
 
 import os
 from collections import Counter, defaultdict
@@ -13,7 +13,7 @@ from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, short
 
 
 def data_table(dataset: TrajectoryDataset) -> Table:
-    """What the dataset holds, a row an embodiment and one of all."""
+    """Return a table of the dataset's content: a row for each embodiment, and one for all."""
     table = Table("embodiment", "tasks", "trajectories", "transitions", "action\nwidth", "length")
     for name in ("with\nreward", "MiB on\ndisk", "bytes a\nframe", "of the\nraw size"):
         table.add_column(name, justify="right")
@@ -46,7 +46,7 @@ def _row(part: TrajectoryDataset) -> list[str]:
 
 
 def spread(dataset: TrajectoryDataset, number: int) -> list[int]:
-    """The numbers of some trajectories, of as many embodiments and tasks as may be."""
+    """Return indices of some trajectories, of as many embodiments and tasks as possible."""
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
     for i, (robot, task) in enumerate(zip(dataset.embodiments, dataset.tasks, strict=True)):
         groups[robot or "", task or ""].append(i)
@@ -63,7 +63,7 @@ def spread(dataset: TrajectoryDataset, number: int) -> list[int]:
 
 
 def contact_sheet(path: str | os.PathLike[str], dataset: TrajectoryDataset, rows: int = 12) -> None:
-    """Draws some trajectories, a row each, from the first image to the last."""
+    """Draw some trajectories, one per row, from the first image to the last."""
     chosen = spread(dataset, rows)
     figure, axes = plt.subplots(
         len(chosen), COLUMNS, figsize=(COLUMNS * 1.1 + 2.4, len(chosen) * 1.12 + 0.5), squeeze=False

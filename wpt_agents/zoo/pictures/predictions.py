@@ -1,4 +1,4 @@
-"""The pictures of predictions: errors over the horizon, and strips of frames."""
+"""Figures of predictions: errors over the horizon, and strips of frames."""
 
 import io
 import os
@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
 INK, MUTED = "#1f2933", "#8a94a0"
-# Okabe and Ito's colours, which the colour-blind tell apart; dashes help in print
+# Okabe and Ito's colour-blind safe colours; dashes help in print
 STYLES: dict[str, dict[str, Any]] = {
     "world model": {"color": "#0072b2", "lw": 2.4},
     "generalist": {"color": "#0072b2", "lw": 2.4},
@@ -31,7 +31,7 @@ COMMON = tuple(STYLES)[:6]  # compared on every robot
 
 
 class Curve(NamedTuple):
-    """The error of one way of predicting on one robot, at the horizons 0, 1, ..."""
+    """The error of one predictor on one robot, at the horizons 0, 1, ..."""
 
     robot: str
     prediction: str
@@ -41,7 +41,7 @@ class Curve(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Rows of (N, 64, 64, 3) uint8 images by name, one column a horizon."""
+    """Rows of (N, 64, 64, 3) uint8 images by name, with one column per horizon."""
 
     title: str
     images: Mapping[str, np.ndarray]
@@ -49,14 +49,14 @@ class Strip(NamedTuple):
 
 
 def style(prediction: str) -> dict[str, Any]:
-    """The line of a way of predicting, by the longest name that it begins with."""
+    """Return the line style of a predictor, by its longest known prefix."""
     return STYLES[max((name for name in STYLES if prediction.startswith(name)), key=len)]
 
 
 def draw_curves(
     path: str | os.PathLike[str], curves: Sequence[Curve], left_out: str | None = None
 ) -> None:
-    """A panel a robot, and one more for a robot that was left out of pre-training."""
+    """Draw a panel for each robot, and one for a robot that was excluded from pre-training."""
     robots = list(dict.fromkeys(curve.robot for curve in curves))
     figure, panels = _grid(len(robots) + (left_out is not None), (3.6, 2.9))
     for axes, robot in zip(panels, robots, strict=False):
@@ -84,7 +84,7 @@ def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
         at = np.arange(len(curve.error))[1:]
         axes.plot(at, curve.error[1:], label=curve.prediction, **look)
         axes.fill_between(at, curve.low[1:], curve.high[1:], color=look["color"], alpha=0.13, lw=0)
-    axes.set(title=title, xlabel="steps ahead", ylabel="squared error an image", yscale="log")
+    axes.set(title=title, xlabel="steps ahead", ylabel="squared error per image", yscale="log")
     axes.set_xticks([1, 10, 20, 30, 40])
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -94,7 +94,7 @@ def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
 
 
 def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
-    """A block a strip: its rows are the ways of predicting, its columns the horizons."""
+    """Draw a block per strip, with predictors as rows and horizons as columns."""
     figure, panels = _grid(len(strips), (4.4, 2.75))
     for axes, strip in zip(panels, strips, strict=False):
         axes.imshow(montage(list(strip.images.values())), interpolation="nearest")
@@ -107,12 +107,12 @@ def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
         axes.spines[:].set_visible(False)
     file = io.BytesIO()
     figure.savefig(file, dpi=110)
-    Image.open(file).convert("RGB").quantize(256).save(path)  # a third of the bytes
+    Image.open(file).convert("RGB").quantize(256).save(path)  # reduces the file to a third
     plt.close(figure)
 
 
 def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:
-    """Rows of (N, H, W, 3) uint8 images as one picture, white between them."""
+    """Join rows of (N, H, W, 3) uint8 images into one picture, separated by white."""
     height, width = rows[0].shape[1:3]
     columns = len(rows[0])
     shape = len(rows) * (height + gap) - gap, columns * (width + gap) - gap, 3
@@ -125,7 +125,7 @@ def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:
 
 
 def _grid(panels: int, panel_size: tuple[float, float]) -> tuple[Any, list[Axes]]:
-    """A figure of three panels a row, or fewer if there are no more; what is left over is empty."""
+    """Make a figure with up to three panels per row; unused panels are empty."""
     columns = min(3, panels)
     height = -(-panels // columns)
     size = columns * panel_size[0], height * panel_size[1]

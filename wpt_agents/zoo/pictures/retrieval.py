@@ -1,4 +1,4 @@
-"""A picture of what retrieval finds: query images beside their nearest trajectories."""
+"""A picture of retrieval results: query images beside their nearest trajectories."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -17,17 +17,17 @@ from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, kind
 
 
 class Query(NamedTuple):
-    """A first image to search for, and what is known of it."""
+    """A first image to search for, with its label and robot."""
 
     name: str
     image: np.ndarray  # (64, 64, 3) uint8
     embodiment: str | None
     action_dim: int
-    number: int | None = None  # its number in the dataset, if it is from there
+    number: int | None = None  # its index, if it is from the dataset
 
 
 class Found(NamedTuple):
-    """A query and the trajectories that begin most like it, nearest first."""
+    """A query and the trajectories with the most similar first images, nearest first."""
 
     query: Query
     indices: np.ndarray  # (k,)
@@ -35,7 +35,7 @@ class Found(NamedTuple):
 
 
 def query_of(dataset: TrajectoryDataset, i: int) -> Query:
-    """The first image of trajectory `i`."""
+    """Return the first image of trajectory `i` as a query."""
     if not 0 <= i < len(dataset):
         raise ValueError(f"No trajectory {i}: {dataset.path} holds {len(dataset)}, from 0 on")
     trajectory = dataset[i]
@@ -44,7 +44,7 @@ def query_of(dataset: TrajectoryDataset, i: int) -> Query:
 
 
 def query_at(task: Task, env: Mapping[str, Any], seed: int = 0) -> Query:
-    """The first image of a task, as fine-tuning by this seed searches for it.
+    """Return the first image of a task as a query, as in fine-tuning with this seed.
 
     :param env: keyword arguments of `gymnasium.make`
     """
@@ -54,9 +54,9 @@ def query_at(task: Task, env: Mapping[str, Any], seed: int = 0) -> Query:
 
 
 def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
-    """The nearest by Eq. (5), the query's own trajectory left out.
+    """Return the nearest by Eq. (5), without the query's own trajectory.
 
-    :param own_robot: only what `WPT.learn` would retrieve, by robot and action width
+    :param own_robot: only those that `WPT.learn` would retrieve, by robot and action width
     """
     assert model.dataset is not None
     robot = query.embodiment if query.embodiment in model.dataset.embodiments else None
@@ -70,7 +70,7 @@ def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
 def retrieval_sheet(
     path: str | os.PathLike[str], dataset: TrajectoryDataset, results: Sequence[Found]
 ) -> None:
-    """Draws each query beside the first images of what was found, its own robot's framed blue."""
+    """Draw each query beside the first images of its nearest; blue frames mark its own robot."""
     columns = max(len(result.indices) for result in results) + 1
     figure, axes = plt.subplots(
         len(results), columns, figsize=(columns * 1.25, len(results) * 1.62 + 0.5), squeeze=False
@@ -93,7 +93,7 @@ def retrieval_sheet(
 
 
 def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], seed: int) -> None:
-    """Draws what a run begins by retrieving, and below it the nearest of all robots."""
+    """Draw the trajectories that a run retrieves, and below them the nearest of all robots."""
     assert model.dataset is not None
     query = query_at(task, env, seed)
     rows = {"retrieved for\n": True, "nearest of all\n": False}

@@ -33,9 +33,9 @@ def learning_curve(
 ) -> None:
     """Draw training returns over simulator frames, and the final scores as lines and a bar.
 
-    :param frames: (N,), at the end of each training episode
-    :param returns: (N,), of each training episode
-    :param scores: by policy; the final one becomes the point at the end
+    :param frames: (N,), frames at the end of each training episode
+    :param returns: (N,), return of each training episode
+    :param scores: scores by policy; the final one is the point at the end
     :param evaluations: frames (M,) and returns (M, episodes) of evaluations during fine-tuning
     """
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
@@ -80,7 +80,7 @@ def prediction_strip(
     context: int,
     columns: int = 12,
 ) -> None:
-    """Draw true images above open-loop predicted ones, the observed part in another colour.
+    """Draw true images above open-loop predictions; another colour marks the observed part.
 
     :param true: (T, 64, 64, 3) uint8
     :param predicted: (T, 64, 64, 3) uint8; the first `context` are reconstructions

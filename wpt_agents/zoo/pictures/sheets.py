@@ -1,4 +1,4 @@
-"""How the sheets of images are drawn: one image, the title, and short names."""
+"""Helpers for sheets of images: single images, titles, and short names."""
 
 import os
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from wpt_agents.zoo.pictures.runs import INK, MUTED, plt
 
-COLUMNS = 8  # images in a row of the contact sheet, and of a run's retrieval sheet
+COLUMNS = 8  # images per row of the contact sheet, and of a run's retrieval sheet
 
 
 def draw(axis: plt.Axes, image: np.ndarray, colour: str = MUTED, width: float = 0.5) -> None:
@@ -30,7 +30,7 @@ def short(task: str | None) -> str | None:
 
 
 def kind(task: str | None, embodiment: str | None) -> str:
-    """The task without its suite, or the robot, in a few letters."""
+    """Return a short name: the task without its suite, or the robot."""
     suite, _, name = (short(task) or "").partition("-")
     return cut(name or suite or embodiment or "", 18)
 

@@ -205,7 +205,7 @@ def read_yaml(text: str) -> Any:
 
 
 def preset_folder() -> Path:
-    """Return the folder of the YAML files: zoo/ in a checkout, zoo/presets in a wheel."""
+    """Return the folder of YAML files: zoo/ in a checkout, wpt_agents/zoo/presets in a wheel."""
     here = Path(__file__).resolve().parents[1]
     for folder in (here / "presets", here.parents[1] / "zoo"):
         if any(folder.glob("*.yaml")):

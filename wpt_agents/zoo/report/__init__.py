@@ -1,1 +1,1 @@
-"""Run folders -> tables for a terminal, and one page that answers: did it work, how sure are we?"""
+"""Reports on run folders: tables for a terminal, and an HTML page."""

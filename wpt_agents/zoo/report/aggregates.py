@@ -1,4 +1,4 @@
-"""All tasks of a suite together: normalised scores, their aggregates, the paper's beside them."""
+"""Aggregates over the tasks of a suite: normalised scores, and the paper's numbers."""
 
 import csv
 from collections import defaultdict
@@ -23,14 +23,14 @@ from wpt_agents.zoo.statistics import (
     resamplable,
 )
 
-BEST_RETURN = 1000.0  # of a DMControl episode; a success rate is a share already
+BEST_RETURN = 1000.0  # maximum return of a DMControl episode; success rates are already normalised
 STATISTICS = {"mean": mean, "median": median, "IQM": iqm, "optimality gap": optimality_gap}
-Estimate = tuple[float, float | None, float | None]  # value, and its 95 % interval if it has one
+Estimate = tuple[float, float | None, float | None]  # value, and its 95 % interval if there is one
 
 
 @dataclass(frozen=True, order=True)
 class Experiment:
-    """What is compared: the runs of one method, variant of a preset and budget on a suite."""
+    """An experiment: the runs of one method, preset variant and budget on a suite."""
 
     suite: str
     variant: Variant
@@ -44,13 +44,13 @@ class Experiment:
 
     @property
     def budget(self) -> str:
-        """'demo, 8,000 frames'."""
+        """Return the label, for example 'demo, 8,000 frames'."""
         return f"{self.variant}, {self.frames:,} frames"
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The paper's score of a method on a task, "mean" and "median" included as tasks."""
+    """The paper's score of a method on a task; "mean" and "median" count as tasks."""
 
     table: int
     suite: str
@@ -65,7 +65,7 @@ class Reference:
 def references() -> tuple[Reference, ...]:
     """Return every number of the paper's Tables 3 to 5, and of the baselines by their authors.
 
-    The method `ncrl` is WPT as its ICLR 2026 version prints it. The files `table*.csv` are the
+    The method `ncrl` is WPT in the ICLR 2026 version of the paper. The files `table*.csv` are the
     paper's tables; `official.csv` holds curves that the authors of DrQ-v2, DreamerV3 and MR.Q
     published, of tasks in Table 5.
     """
@@ -85,7 +85,7 @@ def references() -> tuple[Reference, ...]:
 
 
 def normalised(score: float, metric: str) -> float:
-    """A score with 1 as the best to be had."""
+    """Return a score normalised to a maximum of 1."""
     return score if metric == "success" else score / BEST_RETURN
 
 
@@ -106,13 +106,13 @@ def order(one: Experiment) -> tuple[str, Variant, int, int]:
 
 
 def aggregate(tasks: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
-    """Each of STATISTICS over a suite's tasks, with the stratified bootstrap's interval."""
+    """Return each of STATISTICS over a suite's tasks, with stratified bootstrap intervals."""
     scores = [np.array(runs) for runs in tasks.values()]
     return {name: estimate(statistic, scores) for name, statistic in STATISTICS.items()}
 
 
 def estimate(statistic: Any, *groups: Sequence[np.ndarray]) -> Estimate:
-    """A statistic of scores and its 95 % interval, which it has not if a task has a single run."""
+    """Return a statistic and its 95 % interval, which is None if some task has only one run."""
     value = float(statistic(*groups))
     if not all(map(resamplable, groups)):
         return value, None, None
@@ -123,7 +123,7 @@ def estimate(statistic: Any, *groups: Sequence[np.ndarray]) -> Estimate:
 def improvement(
     ours: Mapping[str, Sequence[float]], theirs: Mapping[str, Sequence[float]]
 ) -> tuple[Estimate, int] | None:
-    """The probability that ours beats theirs, over the tasks that both have, and their number."""
+    """Return the probability that ours beats theirs over common tasks, and their number."""
     common = [task for task in ours if task in theirs]
     if not common:
         return None
@@ -133,7 +133,7 @@ def improvement(
 
 @dataclass(frozen=True)
 class Aggregate:
-    """The paper's mean and median over some tasks, normalised."""
+    """The paper's normalised mean and median over some tasks."""
 
     mean: float
     median: float
@@ -142,7 +142,7 @@ class Aggregate:
 def paper_aggregate(
     suite: str, tasks: Iterable[str], method: str, samples: int
 ) -> Aggregate | None:
-    """Return the paper's mean and median over these tasks, None if it has none of them."""
+    """Return the paper's mean and median over these tasks, None if it has no score for any."""
     names = set(tasks)
     best = BEST_RETURN if suite == "dmc" else 1.0
     scores = [
@@ -156,7 +156,7 @@ def paper_aggregate(
 
 
 def misprint(row: Reference) -> float | None:
-    """What a printed mean or median should be by the rows above it, if they disagree."""
+    """Return the correct mean or median of the rows above, if the printed one differs."""
     if row.task not in ("mean", "median") or row.score is None:
         return None
     scores = [
@@ -167,5 +167,5 @@ def misprint(row: Reference) -> float | None:
         and other.score is not None
     ]
     right = float(np.mean(scores) if row.task == "mean" else np.median(scores))
-    rounding = 0.006 if row.suite == "dmc" else 0.0006  # half of the last digit that is printed
+    rounding = 0.006 if row.suite == "dmc" else 0.0006  # half a unit of the last printed digit
     return None if abs(right - row.score) <= rounding else right

@@ -1,6 +1,6 @@
-"""The evidence of a record: a row per task, the paper's scores beside ours with the usual preset.
+"""The evidence of a record: a row per task with our scores and the paper's.
 
-Runs with changed settings are left out here; the table of every run has them.
+Runs with changed settings are excluded here; the table of every run has them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ UNITS = {"dmc": "a tenth of the mean return", "metaworld": "the success rate in 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The scores of a suite's runs whose preset was not changed, 0 to 100.
+    """The scores (0 to 100) of a suite's runs with an unchanged preset.
 
     :param frames: the usual budget; a column with another one has it in its name
     :param scores: column -> task -> seed -> score
@@ -50,7 +50,7 @@ class Evidence:
 
 
 def usual_lines(lines: Sequence[Line]) -> list[Line]:
-    """Return the lines with an unchanged preset, of tasks with a trained policy among them."""
+    """Return the lines with an unchanged preset, for tasks with a trained policy."""
     budgets = usual_budgets(lines)
     presets = {suite: preset for suite, (_, preset) in budgets.items() if not preset.changes}
     usual = [
@@ -63,7 +63,7 @@ def usual_lines(lines: Sequence[Line]) -> list[Line]:
 
 
 def evidence(lines: Sequence[Line]) -> list[Evidence]:
-    """Return what the record says about each suite with runs of an unchanged preset."""
+    """Return the evidence of each suite with runs of an unchanged preset."""
     budgets = usual_budgets(lines)
     suites: dict[str, dict[str, dict[str, dict[int, float]]]] = {}
     for line in sorted(usual_lines(lines), key=_by_column):
@@ -108,7 +108,7 @@ def markdown(lines: Sequence[Line]) -> str:
 
 
 def explanation(one: Evidence) -> str:
-    """Return what the columns of a table and its last row mean."""
+    """Return the explanation of a table's columns and its last row."""
     unit = UNITS.get(one.suite, " or ".join(UNITS.values()))
     text = (
         f"A score is {unit}, averaged over seeds; their number is in brackets where there are "

@@ -21,7 +21,7 @@ COMPARED = ("wpt", "drq-v2", "dreamer-v3", "r3m", "jsrl-bc", "uds", "explore")
 
 @dataclass(frozen=True)
 class Figure2:
-    """The figure as far as there are runs.
+    """The figure, as complete as the runs allow.
 
     :param curves: SVG, one for each task
     :param missing: a line for each task that lacks methods
@@ -32,7 +32,7 @@ class Figure2:
 
 
 def figure_2(runs: Sequence[Finished], names: Names) -> Figure2 | None:
-    """Return Fig. 2 from whatever runs there are; None without a run of its tasks."""
+    """Return Fig. 2 from the existing runs; None if there is no run of its tasks."""
     drawn = [task_curves(task, runs, names) for task in FIGURE_2]
     curves = [figure for figure in drawn if figure is not None]
     if not curves:

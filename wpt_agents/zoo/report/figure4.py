@@ -1,4 +1,4 @@
-"""Fig. 4 of the paper: a sequence of tasks, and what each method still knows of earlier ones."""
+"""Fig. 4 of the paper: a sequence of tasks, and each method's scores on earlier ones."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
 
 COMPARED = ("wpt", "packnet")
-WINDOW = 10  # training episodes that a point of a curve averages where nothing was evaluated
+WINDOW = 10  # training episodes per point of a curve, if there are no evaluations
 Finished = tuple[Path, SequenceResult]
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """Mean returns of one method: row k is after task k was learned.
+    """Mean returns of one method; row k is measured after learning task k.
 
     :param share: `mean` as a share of WPT's; None where WPT was not run
     """
@@ -60,7 +60,7 @@ def find_sequences(folder: Path) -> list[Finished]:
 
 
 def figures_4(finished: Sequence[Finished]) -> list[Figure4]:
-    """Return a figure for each sequence, preset and budget, from whatever runs there are."""
+    """Return a figure for each sequence, preset and budget, from the existing runs."""
     groups: dict[tuple[str, str, int], list[Finished]] = defaultdict(list)
     for path, result in finished:
         key = result.sequence, str(result.variant), result.frames
@@ -99,7 +99,7 @@ def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finishe
 
 
 def _missing(finished: Sequence[Finished]) -> list[str]:
-    """Say of each sequence that is not finished how many tasks it has."""
+    """Return a line for each unfinished sequence with its number of tasks."""
     lines = []
     for _, result in finished:
         if left := len(result.tasks) - len(result.rows):
@@ -108,7 +108,7 @@ def _missing(finished: Sequence[Finished]) -> list[str]:
 
 
 def _share(runs: Sequence[Finished], ours: Sequence[Finished]) -> float | None:
-    """Return the mean return while learning as a share of WPT's, on the tasks that both have."""
+    """Return the mean return during learning as a share of WPT's, on common tasks."""
     if not ours:
         return None
     common = min(len(result.rows) for _, result in [*runs, *ours])

@@ -1,4 +1,4 @@
-"""The page's figures, drawn by matplotlib as SVG whose colours are the page's, light or dark."""
+"""The page's figures: SVG by matplotlib that uses the page's light or dark colours."""
 
 import io
 import re
@@ -14,13 +14,13 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Placeholders that matplotlib draws with and `svg` replaces by the page's CSS variables.
+# Placeholder colours, which `svg` replaces with the page's CSS variables.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"
 SERIES = tuple(f"#a1000{number}" for number in range(1, 9))
 VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"} | {
     colour: f"var(--series-{number})" for number, colour in enumerate(SERIES, 1)
 }
-STYLE: dict[Any, Any] = {  # matplotlib lists the keys' names as their type
+STYLE: dict[Any, Any] = {  # matplotlib's type for the keys is a list of names
     **{"svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9},
     **{"text.color": INK, "axes.edgecolor": GRID, "axes.labelcolor": MUTED},
     **{"xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": MUTED},
@@ -49,9 +49,9 @@ class Line:
 
 
 def svg(figure: Figure, title: str) -> str:
-    """The figure as an `<svg>` element for a page; `title` is what a screen reader says."""
+    """Return the figure as an `<svg>` element; `title` is for screen readers."""
     file = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": title}):  # ids that differ between figures
+    with matplotlib.rc_context({"svg.hashsalt": title}):  # ids that are unique to each figure
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     plt.close(figure)
     text = file.getvalue()
@@ -74,12 +74,12 @@ def _axes() -> tuple[Figure, Axes]:
 
 
 def colour_of(label: str, labels: Sequence[str]) -> str:
-    """A series' colour, the same in every figure that has the same series."""
+    """Return a series' colour, the same in all figures with the same series."""
     return SERIES[list(labels).index(label) % len(SERIES)]
 
 
 def dashes_of(label: str, labels: Sequence[str]) -> str:
-    """Return a series' line style, which differs where more series than colours share a colour."""
+    """Return a series' line style, which distinguishes series that share a colour."""
     return ("-", "--", ":")[list(labels).index(label) // len(SERIES) % 3]
 
 
@@ -91,10 +91,10 @@ def lines(
     labels: Sequence[str],
     step: bool = False,
 ) -> str:
-    """Lines with their bands.
+    """Draw lines with their bands.
 
-    :param labels: all series of the page, for their colours
-    :param step: draw stairs, as for a distribution
+    :param labels: all series of the page, for the colours
+    :param step: draw steps, as for a distribution
     """
     with matplotlib.rc_context(STYLE):
         figure, axes = _axes()
@@ -125,7 +125,7 @@ def bars(
     series: Mapping[str, tuple[float, float | None, float | None]],
     colours: Sequence[str],
 ) -> str:
-    """A bar for each name, with its 95 % interval where it has one."""
+    """Draw a bar for each name, with its 95 % interval if there is one."""
     with matplotlib.rc_context(STYLE):
         figure, axes = _axes()
         for place, (value, low, high) in enumerate(series.values()):
@@ -138,6 +138,6 @@ def bars(
         axes.set_title(title, wrap=True)
         axes.set(ylabel=y_label)
         if not any(max(value, high or 0) > 0 for value, _, high in series.values()):
-            axes.set_ylim(0, 1)  # nothing to see: an axis around 0 would look like a fault
+            axes.set_ylim(0, 1)  # avoid an axis around 0, which would look like an error
         axes.grid(False, axis="x")
         return svg(figure, title)

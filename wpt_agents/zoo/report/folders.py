@@ -1,4 +1,4 @@
-"""Run folders, read back for a report."""
+"""Read run folders for a report."""
 
 import base64
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Finished:
 
     @property
     def experiment(self) -> Experiment:
-        """The experiment that it is a run of."""
+        """The experiment that the run belongs to."""
         return Experiment.of(self.result)
 
     def text(self, name: str) -> str:
@@ -32,7 +32,7 @@ class Finished:
 
     @property
     def name(self) -> str:
-        """A unique name, of characters that a web address may have."""
+        """A unique name that is valid in a web address."""
         one = self.experiment
         return f"{self.result.task}-{one.method}-{one.variant}-{one.frames}-{self.result.seed}"
 
@@ -49,7 +49,7 @@ class Finished:
         return entries
 
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return frames (N,) and scores (N, episodes), successes where the task counts them."""
+        """Return frames (N,) and scores (N, episodes), which are successes for such tasks."""
         stored = Evaluations.read(self.folder / EVALUATIONS)
         if stored is None:
             return None
@@ -68,7 +68,7 @@ class Unfinished:
 
     @property
     def last_line(self) -> str:
-        """The exception alone."""
+        """The exception without the traceback."""
         return self.error.splitlines()[-1] if self.error else "stopped, or still running"
 
 
@@ -80,7 +80,7 @@ def data_uri(kind: str, content: bytes) -> str:
 def find_finished(folder: Path) -> list[Finished]:
     """Return every finished run below `folder`, in the order of their paths.
 
-    :raises ValueError: a run that is there twice, which would count as two seeds
+    :raises ValueError: if a run exists twice, which would count as two seeds
     """
     runs = []
     seen: dict[object, Path] = {}

@@ -1,4 +1,4 @@
-"""The page's first answers: on how many tasks WPT is above other policies, and the mean score."""
+"""The page's headline: WPT's wins and losses against other policies, and the mean score."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from wpt_agents.zoo.statistics import mean, mean_interval
 
 SUITES = {"dmc": "DMControl", "metaworld": "Meta-World", "robotics": "Gymnasium-Robotics"}
 OURS = "wpt"
-COMPARED = {  # what the page calls a policy, and its `policy_name`
+COMPARED = {  # a policy's label on the page, and its `policy_name`
     "random policy": RANDOM,
     "prior actor": PRIOR_ACTOR,
     "same, from scratch": "scratch",
@@ -26,7 +26,7 @@ Policies = dict[str, dict[int, float]]  # name -> seed -> score
 
 @dataclass(frozen=True)
 class Comparison:
-    """On how many of `tasks` tasks WPT's interval lies above that of another policy, or below."""
+    """The number of tasks on which WPT's interval lies above or below another policy's."""
 
     policy: str
     above: int
@@ -56,7 +56,7 @@ def headlines(results: Sequence[Result]) -> list[Headline]:
         for policy in result.scores:
             name = policy_name(result, policy)
             if name == PRIOR_ACTOR and result.method != OURS:
-                continue  # other methods clone the same way, from other seeds
+                continue  # other methods have the same prior actor with other seeds
             task.setdefault(name, {})[result.seed] = result.counted(policy)
     return [
         Headline(SUITES[suite], preset, frames, compare(list(tasks.values())))
@@ -66,7 +66,7 @@ def headlines(results: Sequence[Result]) -> list[Headline]:
 
 
 def compare(tasks: Sequence[Policies]) -> list[Comparison]:
-    """Compare WPT with each of COMPARED, over the tasks on which both have several seeds."""
+    """Compare WPT with each of COMPARED, on tasks with several seeds of both."""
     comparisons = []
     for title, name in COMPARED.items():
         pairs = [
@@ -103,7 +103,7 @@ def both_suites(results: Sequence[Result]) -> list[BothSuites]:
     """Return the paper's aggregate for each preset and method that has runs of both suites."""
     runs: dict[tuple[str, Variant], dict[str, Mapping[str, list[float]]]] = defaultdict(dict)
     every = aggregates.by_experiment(results).items()
-    for one, tasks in sorted(every, key=_largest_budget_first):  # so the smallest budget stays
+    for one, tasks in sorted(every, key=_largest_budget_first):  # keeps the smallest budget
         runs[one.method, one.variant][one.suite] = tasks
     means = []
     for (method, preset), suites in runs.items():

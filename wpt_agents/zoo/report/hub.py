@@ -12,23 +12,23 @@ from wpt_agents.zoo.machine import import_extra
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.result import Result, read_result
 
-# What is shared; logs, replay and checkpoints stay at home.
+# The files to upload; logs, replay and checkpoints are not uploaded.
 FILES = (
     *("model.zip", "best_model.zip", "config.yaml", "result.json", "system.json"),
     *("evaluations.npz", "0.monitor.csv", "policy.mp4", "learning_curve.png", "predictions.png"),
     "retrieval.png",
 )
-VIDEO = "replay.mp4"  # the name that the hub shows a policy's video under
+VIDEO = "replay.mp4"  # the file name under which the hub shows a policy's video
 
 
 def push(folder: Path, name: str, private: bool = False) -> str:
-    """Uploads a finished run and its card; the repository is made if it is not there.
+    """Upload a finished run and its card; create the repository if it does not exist.
 
     :param name: `user/repository`
     :return: the address
     """
     _check(name)
-    find_trained(folder)  # says what is missing, before anything is made
+    find_trained(folder)  # raises an error before anything is created
     result = read_result(folder)
     if result is None:
         raise ValueError(f"{folder} has no result.json: only finished runs are pushed")
@@ -38,7 +38,7 @@ def push(folder: Path, name: str, private: bool = False) -> str:
             if (folder / file).exists():
                 shutil.copy2(folder / file, Path(aside) / file)
         config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-        config.pop("data", None)  # in older runs a path on their machine
+        config.pop("data", None)  # in older runs it is a local path
         (Path(aside) / "config.yaml").write_text(
             yaml.safe_dump(config, sort_keys=False), encoding="utf-8"
         )
@@ -51,10 +51,10 @@ def push(folder: Path, name: str, private: bool = False) -> str:
 
 
 def pull(name: str, out: Path) -> Path:
-    """Downloads what `push` uploaded into the folder `out`, which must be new or empty."""
+    """Download the files of `push` into the folder `out`, which must be new or empty."""
     _check(name)
     if out.exists() and any(out.iterdir()):
-        raise ValueError(f"{out} is not empty; name a new folder with --out")
+        raise ValueError(f"{out} is not empty; choose a new folder with --out")
     hub = import_extra("huggingface_hub", "hub")
     hub.snapshot_download(name, local_dir=out, allow_patterns=list(FILES))
     if not (out / "config.yaml").exists():

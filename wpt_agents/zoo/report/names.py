@@ -1,11 +1,11 @@
-"""How the policies of runs are called in tables, records and pages."""
+"""The names of policies in tables, records and pages."""
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.result import NOTHING, PRIOR_ACTOR, RANDOM, UNTRAINED, Result
 
 TITLES = {NOTHING: "doing nothing", RANDOM: "random policy"}
-WPT_CLONES = [  # methods whose prior actor is that of `wpt`, if they have one
+WPT_CLONES = [  # methods with the same prior actor as `wpt`, if they have one
     name
     for name, method in METHODS.items()
     if method.agent is WPT and method.pretrained and "retrieval" not in method.keywords
@@ -15,8 +15,8 @@ WPT_CLONES = [  # methods whose prior actor is that of `wpt`, if they have one
 def policy_name(result: Result, policy: str) -> str:
     """Return 'wpt', 'wpt, last', 'prior actor', 'prior actor, no-pretrain', 'random'.
 
-    The policy that a run counts for bears the name of the method alone. The prior actor of the
-    methods that clone as `wpt` does bears none.
+    The policy that counts for a run has the name of the method. The name of a prior actor omits the
+    method if it is trained as in `wpt`.
     """
     if policy in UNTRAINED:
         return policy
@@ -28,5 +28,5 @@ def policy_name(result: Result, policy: str) -> str:
 
 
 def policy_title(name: str) -> str:
-    """Return the words of a table for a name of `policy_name`."""
+    """Return the label in tables for a name of `policy_name`."""
     return TITLES.get(name, name)

@@ -1,4 +1,4 @@
-"""The report as one HTML page: no network, no script that it needs, light and dark, any width."""
+"""The report as one HTML page, which works offline and without scripts."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ MEDIA = ("first", "all", "none")
 
 
 def write_page(folder: Path, path: Path, media: str = "first") -> None:
-    """Write the page about all runs below `folder` to `path`, as a whole or not at all.
+    """Write the page about all runs below `folder` to `path` atomically.
 
     :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
         seed of its best-known method), or of "none"; they make up most of the page's size
@@ -84,7 +84,7 @@ def render(
 
 
 def interval_of(score: Score) -> str:
-    """Write the 95 % interval of a score over its episodes."""
+    """Format the 95 % interval of a score over its episodes."""
     _, low, high = score.interval
     return "–" if low is None else tables.interval_text(low, high)
 
@@ -95,7 +95,7 @@ def _order(run: Finished) -> tuple[str, str, Variant, int, int, int]:
 
 
 def illustrated(run: Finished, runs: Sequence[Finished]) -> set[str]:
-    """Return the choices of media under which the run is shown with its pictures."""
+    """Return the values of `media` that include the run's pictures."""
     first = next(one for one in runs if one.result.task == run.result.task)
     return {"all", "first"} if run is first else {"all"}
 

@@ -1,4 +1,4 @@
-"""Two policies of a record compared task by task: wins, mean difference, and the sign test."""
+"""Compare two policies of a record task by task: wins, mean difference, and sign test."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ PAIRS = (
     *(("wpt+", "prior actor"), ("wpt+", "scratch"), ("wpt+", "wpt"), ("wpt+", PAPER_WPT)),
     *(("wpt", "prior actor"), ("wpt", "scratch")),
 )
-EQUAL = 1e-6  # scores are rounded to two decimals; their means differ by rounding errors
+EQUAL = 1e-6  # scores are rounded to two decimals, so means may differ by rounding errors
 
 
 @dataclass(frozen=True)
 class Pair:
-    """The differences between two policies, in points, one for each task that both have.
+    """The differences between two policies, in points, one for each common task.
 
     :param differences: the first policy's mean over the seeds that both have, minus the second's
     """
@@ -33,17 +33,17 @@ class Pair:
 
     @property
     def above(self) -> int:
-        """The number of tasks on which the first policy scores more."""
+        """The number of tasks on which the first policy has the higher score."""
         return sum(difference > EQUAL for difference in self.differences)
 
     @property
     def below(self) -> int:
-        """The number of tasks on which the first policy scores less."""
+        """The number of tasks on which the first policy has the lower score."""
         return sum(difference < -EQUAL for difference in self.differences)
 
     @property
     def interval(self) -> tuple[float | None, float | None]:
-        """The 95 % bootstrap interval of the mean difference over tasks, none of a single task."""
+        """The 95 % bootstrap interval of the mean difference over tasks, None for a single task."""
         if len(self.differences) < 2:
             return None, None
         low, high = bootstrap(mean, [np.array(self.differences)])
@@ -98,8 +98,8 @@ def compare(one: Evidence, first: str, second: str) -> Pair | None:
 def last_scores(one: Evidence, method: str) -> dict[str, Mapping[int, float]]:
     """Return task -> seed -> score of the last policies.
 
-    A record names the policy that a run counts for by the method alone. That is the last policy,
-    unless the run kept the best one: then the last one is "METHOD, last".
+    In a record, the final policy has the name of the method. It is the last policy, unless the run
+    kept the best one; then the last one is named "METHOD, last".
     """
     last = one.scores.get(f"{method}, last", {})
     return {

@@ -13,7 +13,7 @@ from wpt_agents.zoo.report.sections import BASELINES, Names
 from wpt_agents.zoo.report.tables import interval_text
 from wpt_agents.zoo.statistics import mean_interval
 
-OFFICIAL = {  # what the authors of these published, on eight tasks of Table 5
+OFFICIAL = {  # published by the authors of these methods, on eight tasks of Table 5
     "dreamer-v3-official": "Dreamer v3, its authors",
     "drq-v2-official": "DrQ v2, its authors",
     "mrq-official": "MR.Q, its authors",
@@ -28,8 +28,8 @@ class Cell:
 
     :param run: the name of the first run, None for an aggregate over tasks
     :param tasks: the number of tasks of an aggregate
-    :param interval: of 95 % over seeds, by Student's t
-    :param note: budget, seeds and commits; "" where the column's head has them
+    :param interval: the 95 % interval over seeds, by Student's t
+    :param note: budget, seeds and commits; "" if they are in the column's heading
     """
 
     mean: float
@@ -43,8 +43,8 @@ class Cell:
 class TableRow:
     """One task, or the mean or median over tasks.
 
-    :param paper: the printed scores, each with what a misprinted one should be
-    :param ours: a cell for each of our columns, None where we have no run
+    :param paper: the printed scores, each with the correct value if it is a misprint
+    :param ours: a cell for each of our columns, None without a run
     """
 
     task: str
@@ -55,7 +55,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One of the tables; tasks that were not run stand apart.
+    """One of the tables; tasks without runs are separate.
 
     :param ours: our columns' names, each with the note that all of its cells share
     """
@@ -136,13 +136,13 @@ def table_row(
 
 
 def shared_note(rows: Sequence[TableRow], place: int) -> str:
-    """Return the note that all cells of one of our columns share, "" if they differ."""
+    """Return the common note of the cells in one of our columns, "" if they differ."""
     notes = {cell.note for row in rows if (cell := row.ours[place]) and cell.run}
     return notes.pop() if len(notes) == 1 else ""
 
 
 def without_notes(row: TableRow, notes: Sequence[str]) -> TableRow:
-    """Return the row without the notes that stand at the head of its columns."""
+    """Return the row without the notes that are in the headings of its columns."""
     cells = [
         replace(cell, note="") if cell and note else cell
         for cell, note in zip(row.ours, notes, strict=True)
@@ -157,12 +157,12 @@ def our_aggregate(name: str, tasks: Sequence[Sequence[Finished]]) -> Cell:
 
 
 def samples_text(samples: int) -> str:
-    """Write a number of samples as 150k or 1M."""
+    """Format a number of samples as 150k or 1M."""
     return f"{samples // 1000}k" if samples < 10**6 else f"{samples // 10**6}M"
 
 
 def our_cell(runs: Sequence[Finished]) -> Cell | None:
-    """Return mean, interval, seeds, budget and commits of runs that differ in their seed alone."""
+    """Return mean, interval, seeds, budget and commits of runs that differ only in the seed."""
     if not runs:
         return None
     first = runs[0].result

@@ -1,7 +1,7 @@
 """The record: one CSV line per task, method, seed and policy, small enough for a repository.
 
-Run folders are large and are lost with their machine; the record keeps what they found. It grows:
-lines of runs that no longer exist stay, lines of the same run are replaced.
+Run folders are large and may be deleted; the record keeps their results. Lines of runs that no
+longer exist are kept, and lines of the same run are replaced.
 """
 
 import csv
@@ -21,13 +21,13 @@ from wpt_agents.zoo.result import UNTRAINED, Result, Variant
 
 @dataclass(frozen=True)
 class Line:
-    """What one policy of one run scored.
+    """The score of one policy of one run.
 
-    :param method: the run's method for the policy that it counts for, else the policy's name
+    :param method: the run's method for its final policy, else the policy's name
     :param score: 0 to 100 as in the paper: the return / 10, or the share of successes x 100
-    :param hours: of the whole run, shared stages that it had to make included
+    :param hours: hours of the whole run, including shared stages that it executed
     :param updates: gradient updates of fine-tuning; None where unknown, as in version 0.1
-    :param cpu_hours: processor hours of fine-tuning; None where unknown
+    :param cpu_hours: CPU hours of fine-tuning; None where unknown
     :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
         fine-tuning began with; "" without one, or where unknown
     :param policy: one of `POLICIES`; "" in records of version 0.1
@@ -52,7 +52,7 @@ class Line:
 
     @property
     def run(self) -> tuple[str, str, str, int, int]:
-        """What tells this line from every other."""
+        """The identity of the line."""
         return self.task, self.method, str(self.preset), self.frames, self.seed
 
 
@@ -67,7 +67,7 @@ OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy")  # records of versio
 
 def lines_of(runs: Iterable[Finished]) -> list[Line]:
     """Return the lines of run folders; untrained policies once per task and seed."""
-    last = sorted(runs, key=lambda run: run.result.method == "wpt")  # its clone is the one shown
+    last = sorted(runs, key=lambda run: run.result.method == "wpt")  # its prior actor is shown
     lines = {line.run: line for run in last for line in _lines(run.result)}
     return sorted(lines.values(), key=order)
 
@@ -113,9 +113,9 @@ def place(method: str) -> int:
 
 
 def update(path: Path, lines: Iterable[Line]) -> list[Line]:
-    """Write `lines` into the record at `path`, as a whole or not at all.
+    """Add `lines` to the record at `path` atomically.
 
-    :return: every line that it holds now
+    :return: all lines of the updated record
     """
     before = read(path) if path.exists() else []
     every = sorted({line.run: line for line in [*before, *lines]}.values(), key=order)
@@ -132,7 +132,7 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
 def read(path: Path) -> list[Line]:
     """Read the lines of a record.
 
-    :raises ValueError: a file that is no record, or is damaged
+    :raises ValueError: if the file is no record or is damaged
     """
     with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -1,7 +1,7 @@
-"""A record as a picture: a panel per task, or a row per task where there are many.
+"""A record as a picture: a panel per task, or a row per task if there are many.
 
-Both leave out runs with changed settings if there are others, and show the paper's WPT as a hollow
-marker. Colours are those of Okabe and Ito, which colour-blind readers can tell apart.
+Both exclude runs with changed settings if there are others, and show the paper's WPT as a hollow
+marker. The colours are Okabe and Ito's colour-blind safe ones.
 """
 
 from collections import defaultdict
@@ -27,7 +27,7 @@ PANELS = 8  # up to this number of tasks each has a panel
 
 
 class Style(NamedTuple):
-    """How a method is drawn, the same in every picture."""
+    """The style of a method, the same in every picture."""
 
     colour: str
     marker: str
@@ -41,11 +41,11 @@ STYLES = {
     "wpt+": Style("#d55e00", "D"),
     "kickstart": Style("#e69f00", "^"),
 }
-OTHERS = (  # of the other methods, in turn
+OTHERS = (  # for the other methods, in turn
     *(Style("#56b4e9", "P"), Style("#000000", "*"), Style("#56b4e9", "<")),
     *(Style("#000000", ">"), Style("#56b4e9", "X"), Style("#000000", "p")),
 )
-GREY = Style("#777777", "o")  # of the other methods in panels, whose rows have names
+GREY = Style("#777777", "o")  # for the other methods in panels, whose rows have names
 PAPER: dict[str, Any] = {
     "marker": "D",
     "ms": 9,
@@ -95,7 +95,7 @@ def draw_rows(suites: Sequence[Evidence]) -> Figure:
 
 
 def drawn(method: str) -> bool:
-    """Return whether rows of tasks show a method; the tables show every one."""
+    """Return whether a method is shown in rows of tasks; the tables show all methods."""
     return method != "nothing" and not method.endswith((", last", ", after head start"))
 
 
@@ -197,7 +197,7 @@ def _draw_panel(panel: Axes, title: str, rows: Sequence[PanelRow]) -> None:
 
 
 def row_names(keys: Iterable[Key]) -> list[str]:
-    """Return the methods; one of several presets or budgets with what tells these apart."""
+    """Return the methods, with preset or budget if there are several."""
     keys = list(keys)
     presets: dict[str, set[frozenset[str]]] = defaultdict(set)
     budgets: dict[str, set[int]] = defaultdict(set)

@@ -13,7 +13,7 @@ from wpt_agents.zoo.report.tables import interval_text, markdown_table, number
 from wpt_agents.zoo.result import Variant
 from wpt_agents.zoo.statistics import Scores, bootstrap, mean, mean_interval
 
-OURS = ("wpt+", "wpt")  # the methods that a record is about
+OURS = ("wpt+", "wpt")  # the main methods of a record
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Cell:
 
 
 class Key(NamedTuple):
-    """What a cell is about."""
+    """The identity of a cell."""
 
     method: str
     preset: Variant
@@ -73,7 +73,7 @@ def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, Means]]:
 
 
 def column(line: Line, frames: int, preset: Variant) -> str:
-    """Return the method, and what is unusual about its run: "scratch, 3x frames"."""
+    """Return the method with unusual settings of its run: "scratch, 3x frames"."""
     ratio = line.frames / frames
     name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
     same = line.preset == (preset if line.frames else preset.playing)
@@ -115,7 +115,7 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, Mea
 def _cell(strata: Sequence[np.ndarray], statistic: Callable[[Scores], np.ndarray]) -> Cell:
     low = None
     high = None
-    if all(len(stratum) > 1 for stratum in strata):  # a single seed would seem to be certain
+    if all(len(stratum) > 1 for stratum in strata):  # one seed has no spread
         low, high = map(float, bootstrap(statistic, strata))
     scores = tuple(float(s) for stratum in strata for s in stratum)
     return Cell(scores, float(statistic(strata)), low, high)

@@ -25,7 +25,7 @@ THRESHOLDS = np.linspace(0, 1, 51)
 
 
 class Names:
-    """Names of experiments: the method, and the budget too where a suite has several."""
+    """Names of experiments: the method, with the budget if a suite has several."""
 
     def __init__(self, experiments: Iterable[Experiment]) -> None:
         self.budgets: dict[str, set[str]] = defaultdict(set)
@@ -54,7 +54,7 @@ class MethodRow:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One of the paper's methods over the tasks that were run."""
+    """One of the paper's methods over the tasks with runs."""
 
     name: str
     aggregate: Aggregate
@@ -71,12 +71,12 @@ class Improvement:
 
 @dataclass(frozen=True)
 class Section:
-    """Everything that the page says about a suite; figures are SVG.
+    """The page's content about a suite; figures are SVG.
 
     :param names: of the suite's experiments
     :param all_names: of all experiments of the page, for the colours
     :param tasks: the number of the suite's tasks in the paper
-    :param ablation_missing: the methods of Fig. 5 of which there is no run
+    :param ablation_missing: the methods of Fig. 5 without runs
     """
 
     name: str
@@ -183,7 +183,7 @@ def ablation(suite: str, experiments: Mapping[Experiment, Scores], names: Names)
 def draw_ablation(
     suite: str, budget: str, experiments: Mapping[Experiment, Scores], names: Names
 ) -> str:
-    """Draw the means over the tasks that all methods have; nothing if there is none to compare."""
+    """Draw the means over the common tasks of all methods, if there are any."""
     common = set.intersection(*(set(tasks) for tasks in experiments.values()))
     if len(experiments) < 2 or not common:
         return ""

@@ -20,10 +20,10 @@ from wpt_agents.zoo.statistics import mean, mean_interval
 
 @dataclass(frozen=True)
 class Row:
-    """One task and method over its seeds; a seed counts by its mean over episodes.
+    """One task and method over its seeds, each averaged over episodes.
 
     :param low: lower end of the 95 % interval over seeds (Student's t), None with one seed
-    :param paper: the paper's score of this method at 150,000 frames, where it gives one
+    :param paper: the paper's score of this method at 150,000 frames, if there is one
     """
 
     task: str
@@ -52,19 +52,19 @@ def summarise(results: Iterable[Result]) -> list[Row]:
 
 @dataclass(frozen=True)
 class PolicyRow:
-    """One policy on one task over its seeds, by return. Intervals are of 95 %.
+    """The returns of one policy on one task over its seeds, with 95 % intervals.
 
     :param method: "" for an untrained policy
     :param policy: one of `result.POLICIES`
-    :param name: what tables call it
-    :param final: whether its runs count for it
+    :param name: its name in tables
+    :param final: whether it is the final policy of its runs
     :param means: the mean of each seed over its `episodes` episodes
     :param episodes_low: by a bootstrap of the episodes within each seed, as if these seeds were
         played again; None with one episode
     :param seeds_low: by a bootstrap of the seeds' means, as if other seeds were trained; None with
         one seed
     :param t_low: the same by Student's t, which is wider for few seeds
-    :param success: the share of successful episodes, None where the task counts none
+    :param success: the share of successful episodes, None if the task reports none
     """
 
     task: str
@@ -129,7 +129,7 @@ def policies(results: Iterable[Result]) -> list[PolicyRow]:
         for policy in result.scores:
             method = "" if policy in UNTRAINED else result.method
             group = result.task, result.variant, result.frames, method, policy
-            groups[group][result.seed] = result  # untrained ones are the same for all methods
+            groups[group][result.seed] = result  # untrained policies are the same for all methods
     rows = [PolicyRow.of(group[-1], list(runs.values())) for group, runs in groups.items()]
     return sorted(rows, key=_by_method)
 
@@ -150,12 +150,12 @@ def paper_scores() -> dict[tuple[str, str], float]:
 
 
 def interval_text(low: float | None, high: float | None) -> str:
-    """Write a 95 % interval for a table's cell."""
+    """Format a 95 % interval for a table's cell."""
     return "-" if low is None or high is None else f"{number(low)} to {number(high)}"
 
 
 def number(value: float | None) -> str:
-    """Write a score with the digits that matter: 0.42, 7.3, 512."""
+    """Format a score with its significant digits: 0.42, 7.3, 512."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 2 else 1 if abs(value) < 100 else 0
@@ -201,7 +201,7 @@ def summary_table(rows: Sequence[Row]) -> Table:
         words = heading in ("task", "method", "preset")
         table.add_column(heading, justify="left" if words else "right")
     for row in rows:
-        table.add_row(*map(escape, cells(row)))  # a preset's name may hold brackets
+        table.add_row(*map(escape, cells(row)))  # a preset's name may contain brackets
     return table
 
 
@@ -211,7 +211,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return text in columns, as Markdown."""
+    """Return a Markdown table."""
     every = [headings, ["---"] * len(headings), *lines]
     return "".join(f"| {' | '.join(line)} |\n" for line in every)
 

@@ -14,10 +14,10 @@ from wpt_agents.zoo.plan.runs import Run
 
 
 def clear(folder: Path) -> None:
-    """Delete what a run or a sequence has left but its lock.
+    """Delete the files of a run or a sequence except its lock.
 
-    What says that something is finished is deleted first, and `config.yaml`, without which the
-    folder would be refused, last: after a kill in between, the same command can begin again.
+    Results are deleted first and `config.yaml` last, because a folder without it is not accepted:
+    if this is interrupted, the same command can start again.
     """
     config = folder / "config.yaml"
     for path in (folder / "result.json", folder / "sequence.json", *folder.glob("*/scores.json")):
@@ -31,19 +31,19 @@ def clear(folder: Path) -> None:
 
 
 def check_folder(job: Run, force: bool) -> None:
-    """Refuse a folder that is not this run's.
+    """Raise an error for a folder that is not this run's.
 
-    :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
+    :raises ValueError: if it is no run folder, or has other settings and `force` is off
     """
     check_config(job.folder, job.config(), job, force)
 
 
 def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool) -> None:
-    """Refuse a folder whose `config.yaml` has other settings.
+    """Raise an error for a folder whose `config.yaml` has other settings.
 
     :param config: the settings
-    :param job: whose agent they are of
-    :raises ValueError: it is no run folder, or holds a run of other settings and `force` is off
+    :param job: the run or sequence
+    :raises ValueError: if it is no run folder, or has other settings and `force` is off
     """
     path = folder / "config.yaml"
     others = {item.name for item in folder.glob("[!.]*")} - {"lock", "log.txt"}
@@ -52,7 +52,7 @@ def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool)
     if path.exists() and not force:
         section = job.algorithm.section
         keywords = {section: dict(defaults(job.algorithm.agent))}
-        usual = _flat(Preset().as_dict() | keywords)  # of keys that older versions do not know
+        usual = _flat(Preset().as_dict() | keywords)  # for keys that older versions do not have
         before = usual | _flat(yaml.safe_load(path.read_text(encoding="utf-8")))
         now = usual | _flat(json.loads(json.dumps(config)))
         differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))

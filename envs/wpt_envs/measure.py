@@ -1,4 +1,4 @@
-"""Compares the three renderings: their similarity to `exact`, their speed, and how they look."""
+"""Compare the three renderings: similarity to `exact`, speed, and appearance."""
 
 import time
 from collections.abc import Callable, Iterator

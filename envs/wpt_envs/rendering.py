@@ -65,7 +65,7 @@ QUALITIES = {
 
 
 class Renderer:
-    """Draws `data` as one camera sees it, without any effect on the physics.
+    """Draw `data` from one camera, without any effect on the physics.
 
     The GL context is made at the first image, so that environments that never draw need none. It
     is current only while drawing, so that other renderers are not disturbed.

@@ -72,11 +72,11 @@ def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, di
             if header["version"] > VERSION:
                 raise ValueError(f"it is of version {header['version']}: update wpt_agents")
             if header.get("groups", groups) != groups:
-                raise ValueError(f"it should hold {header['groups']} and holds {groups}")
+                raise ValueError(f"it should contain {header['groups']} but contains {groups}")
             return header, {name: _tensors(archive, name) for name in groups}
     except FAULTS as error:
         raise ValueError(
-            f"{name} is no {KIND} of version {VERSION}, or is damaged ({error}); "
+            f"{name} is not a {KIND} of version {VERSION}, or is damaged ({error}); "
             "load another copy or an earlier checkpoint"
         ) from error
 
@@ -94,7 +94,7 @@ def _members(archive: zipfile.ZipFile) -> list[str]:
     for info in archive.infolist():
         known = info.filename == ABOUT or info.filename.endswith(TENSORS)
         if not known or info.compress_type != zipfile.ZIP_STORED:
-            raise ValueError(f"it holds {info.filename!r}, which is not of wpt_agents")
+            raise ValueError(f"it contains {info.filename!r}, which wpt_agents does not write")
     return [name.removesuffix(TENSORS) for name in names if name != ABOUT]
 
 

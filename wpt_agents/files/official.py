@@ -162,8 +162,8 @@ def _load(path: Path) -> Any:
         return torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
         raise ValueError(
-            f"{path} holds objects beside weights, and loading them could run foreign code: ask "
-            f"its author for the state dicts alone ({_first_sentence(error)})"
+            f"{path} holds objects besides weights, and loading them could run foreign code: ask "
+            f"its author for the state dicts only ({_first_sentence(error)})"
         ) from error
     except FAULTS as error:
         raise ValueError(

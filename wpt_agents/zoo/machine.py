@@ -41,7 +41,7 @@ def check_device(device: str) -> None:
     if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
         raise ValueError(
             f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
-            "GPUs here; take --device cpu, or a build of torch with CUDA and a driver"
+            "GPUs here; use --device cpu, or a build of torch with CUDA and a driver"
         )
 
 

@@ -173,9 +173,7 @@ def as_actions(action: np.ndarray) -> np.ndarray:
     if action.ndim == 1:
         action = action[:, None]  # a single actuator
     if action.ndim != 2 or action.dtype.kind not in "fiub":
-        raise ValueError(
-            f"actions must be numbers of shape (T, A), got {action.shape} {action.dtype}"
-        )
+        raise ValueError(f"actions must be numbers (T, A), got {action.shape} {action.dtype}")
     return np.ascontiguousarray(action, np.float32 if action.dtype == np.float32 else np.float64)
 
 

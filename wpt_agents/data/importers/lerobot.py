@@ -64,7 +64,7 @@ class LeRobotEpisodes(Episodes):
             chosen = [name for name in cameras if name.endswith(f".{camera}")]
         if len(chosen) != 1:
             raise ValueError(
-                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; choose one of: "
+                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; give one of: "
                 f"{', '.join(cameras) or 'none, it has no images'}"
             )
         return chosen[0]
@@ -75,7 +75,7 @@ class LeRobotEpisodes(Episodes):
         if missing:
             similar = [name for name in features if "action" in name]
             raise ValueError(
-                f"{self._folder} has no feature {missing[0]!r}; give action_key (--action-key), "
+                f"{self._folder} has no feature {missing[0]!r}; pass action_key (--action-key), "
                 f"one or several of: {', '.join(similar or features)}"
             )
         return self.action_keys or ("action",)

@@ -14,7 +14,7 @@ from wpt_agents.data.importers.official import is_official
 IN_FOLDERS = (("*.tfrecord*", "rlds"), ("*.hdf5", "hdf5"), ("*.h5", "hdf5"), ("*.npz", "npz"))
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
-MAKE = "make a Trajectory(image, action) of each episode, and give their list"
+MAKE = "make a Trajectory(image, action) of each episode, and pass them as a list"
 IMPORT = "python -m wpt_agents.zoo import"
 
 
@@ -88,10 +88,10 @@ def refusal(source: str | os.PathLike[str], formats: str) -> ValueError:
 def _download(name: str) -> str:
     name = re.sub(r"^hf:/*(datasets/)?", "", name)
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
-        return "download it first and give the folder"
+        return "download it first and pass the folder"
     folder = name.split("/")[1]
     return (
-        "if it is a dataset on the Hugging Face Hub, download it first and give the folder: "
+        "if it is a dataset on the Hugging Face Hub, download it first and pass the folder: "
         f"hf download --repo-type dataset {name} --local-dir {folder}"
     )
 
@@ -116,10 +116,10 @@ def _file(path: Path, formats: str) -> str:
     suffix = path.suffix.lower()
     model = model_kind(path) if suffix == ".zip" else None
     if model:
-        return f"is {model}, not data; WPT.load opens models, and dataset= takes data"
+        return f"is {model}, not data; use WPT.load for models, and dataset= for data"
     if suffix == ".npz":
         return (
-            "is one .npz file, so at most one episode; give the folder of all episodes, "
+            "is one .npz file, so at most one episode; pass the folder of all episodes, "
             f"{path.parent}"
         )
     if suffix in (".pt", ".pth"):
@@ -151,7 +151,7 @@ def _folder(path: Path, formats: str) -> str:
     if model is not None:
         return (
             f"is not a dataset: it is a run's folder with {model_kind(model)} ({model.name}); "
-            "dataset= takes data, WPT.load the model file"
+            "use dataset= for data, and WPT.load for the model file"
         )
     if not names:
         return f"is empty; give a folder with data ({formats})"
@@ -172,6 +172,6 @@ def _folder(path: Path, formats: str) -> str:
 
 def _array_record() -> str:
     return (
-        "holds array_record files, TFDS's newer default, which are not read here; write TFRecord "
+        "holds array_record files, TFDS's newer default, which is not supported; write TFRecord "
         "files instead: tfds build --file_format=tfrecord"
     )

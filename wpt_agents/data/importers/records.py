@@ -74,7 +74,7 @@ def read_steps(data: bytes, source: str) -> dict[str, Any]:
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f"{source} is damaged or not a tf.train.Example: {error}") from error
     if not steps:
-        raise ValueError(f"{source} holds no 'steps/...': it is no RLDS episode")
+        raise ValueError(f"{source} has no 'steps/...': it is not an RLDS episode")
     return steps
 
 

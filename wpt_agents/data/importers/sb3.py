@@ -116,8 +116,8 @@ class SB3Episodes(Episodes):
 def _load(path: str | os.PathLike[str], trust: bool) -> ReplayBuffer:
     if not trust:
         raise ValueError(
-            f"{path} is a pickle, as SB3 saves replay buffers, and loading it runs whatever code "
-            "is in it; if you trust it, say so with trust=True (--trust)"
+            f"{path} is a pickle, as SB3 saves replay buffers, and loading it can run any "
+            "code; if you trust it, pass trust=True (--trust)"
         )
     try:
         with open(path, "rb") as file:

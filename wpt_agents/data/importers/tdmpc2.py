@@ -49,8 +49,8 @@ class TdMpc2Episodes(Episodes):
             if self._trust:
                 raise ValueError(f"{file} cannot be read by torch.load: {error}") from error
             raise ValueError(
-                f"{file} is a pickle of more than tensors (.pt), and loading it runs whatever code "
-                "is in it; if you trust it, say so with trust=True (--trust)"
+                f"{file} is a pickle of more than tensors (.pt), and loading it can run any "
+                "code; if you trust it, pass trust=True (--trust)"
             ) from error
         except Exception as error:  # torch raises many types of exceptions for invalid files
             raise ValueError(f"{file} cannot be read by torch.load: {error}") from error

@@ -248,7 +248,7 @@ def _read_label(file: Path) -> dict[str, Any]:
         return json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(
-            f"{file} is damaged ({error}); restore the file, or give another path"
+            f"{file} is damaged ({error}); restore the file, or use another path"
         ) from error
 
 

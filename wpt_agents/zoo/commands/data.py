@@ -42,9 +42,7 @@ Out = Annotated[
 ]
 Episodes = Annotated[
     int | None,
-    typer.Option(
-        min=1, help="The number of episodes of each task; by default as many as in the paper."
-    ),
+    typer.Option(min=1, help="The number of episodes of each task; by default the paper's number."),
 ]
 Behaviour = Annotated[
     str,

@@ -31,7 +31,7 @@ Embodiment = Annotated[str | None, typer.Option(help="The name of the robot, for
 Task = Annotated[str | None, typer.Option(help="The name of the task, for all episodes.")]
 Rewards = Annotated[bool, typer.Option("--rewards", help="Keep the rewards.")]
 ImageSize = Annotated[
-    int, typer.Option(min=1, help="Resize images to this height and width; WPT takes 64.")
+    int, typer.Option(min=1, help="Resize images to this height and width; WPT needs 64.")
 ]
 Crop = Annotated[
     bool, typer.Option("--crop", help="Cut out the middle square instead of squeezing images.")

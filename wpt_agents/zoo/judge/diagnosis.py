@@ -118,14 +118,14 @@ def diagnose(
     """
     model = trained.load(device=device)
     if not isinstance(model, WPT):
-        raise ValueError(f"{trained.model} has no world model: diagnose takes runs of WPT")
+        raise ValueError(f"{trained.model} has no world model: diagnose supports only WPT")
     low, high = model.action_space.low, model.action_space.high
     returns, errors, promised = list[float](), list[float](), list[list[Promise]]()
     with closing(gym.make(trained.task, **trained.env)) as env:
         for episode in range(episodes):
             played = record(env, acting(model), seed + episode)
             if len(played) < horizon:
-                raise ValueError(f"An episode lasts {len(played)} steps: take a shorter --horizon")
+                raise ValueError(f"An episode lasts {len(played)} steps: use a shorter --horizon")
             unit = 2 * (played.action - low) / (high - low) - 1
             played = replace(played, action=unit.astype(np.float32))
             starts = np.linspace(0, len(played) - horizon, STARTS).astype(int).tolist()

@@ -50,7 +50,7 @@ def check_space(jobs: Sequence[Run]) -> None:
     if free < needed:
         raise ValueError(
             f"{folder} has {gigabytes(free)} free and these runs need about {gigabytes(needed)}: "
-            "make room, use another --out, or take a smaller preset"
+            "make room, use another --out, or use a smaller preset"
         )
 
 

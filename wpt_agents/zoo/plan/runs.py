@@ -116,7 +116,7 @@ class Run:
 
     @property
     def retrieves(self) -> bool:
-        """Whether the run needs trajectories of the task's robot from the dataset."""
+        """True if the run needs trajectories of the task's robot from the dataset."""
         if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
             return self.algorithm.needs_data
         wpt = SimpleNamespace(**self.full_keywords)
@@ -272,7 +272,7 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     if run.retrieves and needed not in widths:
         raise ValueError(
             f"{short_name(run.task)} has {needed} actions, and nothing in the data has as many "
-            f"({', '.join(map(str, sorted(widths)))}): name other --tasks, add such a task to "
+            f"({', '.join(map(str, sorted(widths)))}): use other --tasks, add such a task to "
             "collect.tasks (--set), use --data that has one, or use --method scratch or "
             "pretrain-only"
         )

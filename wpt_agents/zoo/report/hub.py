@@ -64,7 +64,7 @@ def pull(name: str, out: Path) -> Path:
 
 def _check(name: str) -> None:
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
-        raise ValueError(f"{name!r} is not a repository of the hub: write user/name")
+        raise ValueError(f"{name!r} is not the name of a repository: write user/name")
 
 
 def card(result: Result, name: str) -> str:

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Ten minutes on a GPU: what a step costs at the paper's size, then every stage of a run at that size.
+# Measure a step at the paper's size on a GPU, then execute every stage of a run (ten minutes).
 #
 #   bash examples/gpu.sh            on a GPU
-#   bash examples/gpu.sh --quick    the same commands at the size debug, on a CPU, to try the script
+#   bash examples/gpu.sh --quick    test the script with the size debug on a CPU
 #
 # The folder OUT (gpu-check) gets bench.jsonl, bench.err and the run folder.
 set -euo pipefail
@@ -13,7 +13,7 @@ if [ "${1:-}" = --quick ]; then
     SMALLER=()
 else
     QUICK=() PRESET=paper DEVICE=cuda
-    # So little of everything that all stages fit into minutes. It learns nothing.
+    # All stages finish within minutes with these settings, which are too small to learn anything.
     SMALLER=(--set collect.episodes=2 --set pretrain.steps=50 --set num_retrieve=2 --set bc_steps=100
         --set learning_starts=500 --set warmup_steps=500 --set train_ratio=64 --set evaluate.episodes=2)
 fi

@@ -112,7 +112,7 @@ class _LookRendered(gym.Wrapper):
         self._reader = PictureReader(source, "make it with render_mode='rgb_array'", crop)
 
     def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
+        """Return the current image, (size, size, 3) uint8."""
         return shrink(self._reader.read(self.env.render()), size)
 
 
@@ -137,19 +137,19 @@ class _LookObserved(gym.Wrapper):
         self._reader = PictureReader(source, "choose another image_key", crop)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode and keep its first picture."""
+        """Start an episode and store its first image."""
         observation, info = self.env.reset(**kwargs)
         self._seen = self._reader.read(observation[self._key])
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and keep the picture after it."""
+        """Take a step and store the image after it."""
         observation, *outcome = self.env.step(action)
         self._seen = self._reader.read(observation[self._key])
         return observation, *outcome
 
     def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
+        """Return the current image, (size, size, 3) uint8."""
         return shrink(self._seen, size)
 
 
@@ -187,7 +187,7 @@ class _LookDrawn(gym.Wrapper):
         return self._view
 
     def look(self, size: int) -> np.ndarray:
-        """The picture now: (size, size, 3) uint8."""
+        """Return the current image, (size, size, 3) uint8."""
         return self._open().look(size)
 
     def close(self) -> None:

@@ -66,7 +66,7 @@ class DMControl(Simulated):
     [-1, 1.1], its extend [-0.8, 0.8]).
 
     ## Observation Space
-    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the image after the last repeat, by the
     first camera, for quadruped by the third. dm_control's own observation, flattened, is in
     `info["state"]` with `state_in_info`.
 

@@ -113,7 +113,7 @@ def _bare(task: Task) -> Simulated:
 
 
 def montage(tasks: list[Task], path: Path, size: int = 64, columns: int = 6) -> None:
-    """Write a picture with the three renderings of one state of each task, side by side."""
+    """Write an image with the three renderings of one state of each task, side by side."""
     import imageio.v3
 
     cells = []

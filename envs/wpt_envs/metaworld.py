@@ -54,7 +54,7 @@ class MetaWorld(Achieved):
     `Box(-1, 1, (4,), float32)`: the gripper's move along x, y and z, and its closing.
 
     ## Observation Space
-    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the image after the last repeat, by the
     camera `corner4`. This camera hangs upside down, and its picture is turned over top to bottom
     (not rotated), as is usual. The state of 39 numbers, with the goal, is in `info["state"]`
     with `state_in_info`.

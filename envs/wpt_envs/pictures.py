@@ -14,7 +14,7 @@ class PictureReader:
 
     :param source: the source of the images, for messages, such as "render() of <CarRacing>"
     :param remedy: what the user can do if there is no image
-    :param crop: cut out the middle square; otherwise the first picture that is not square causes a
+    :param crop: cut out the middle square; otherwise the first image that is not square causes a
         warning, because `shrink` will squeeze it
     """
 
@@ -26,7 +26,7 @@ class PictureReader:
         self._warned = False
 
     def read(self, picture: Any) -> np.ndarray:
-        """Check and convert one picture.
+        """Check and convert one image.
 
         :param picture: (H, W, 3), or with one or four channels, or with channels first
         :return: (H, W, 3) uint8, a view where nothing had to be converted; with `crop`, H = W
@@ -60,7 +60,7 @@ class PictureReader:
         )
 
     def _colour(self, array: np.ndarray) -> np.ndarray:
-        """The same picture with three channels, which come last."""
+        """Return the image with three channels, which come last."""
         if array.ndim == 2:
             array = array[..., None]
         if array.ndim == 3 and array.shape[-1] not in (1, 3, 4) and array.shape[0] in (1, 3, 4):

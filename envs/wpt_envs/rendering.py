@@ -72,7 +72,7 @@ class Renderer:
 
     :param camera: name or number of a camera of the model, -1 for the free camera, or a dict of
         attributes of the free camera, such as `distance`
-    :param flip: turn the picture upside down
+    :param flip: flip the image upside down
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Renderer:
         self._finalizer: weakref.finalize | None = None
 
     def render(self) -> np.ndarray:
-        """Return the picture now: (size, size, 3) uint8, the top row first."""
+        """Return the current image, (size, size, 3) uint8, the top row first."""
         if self._gl is None or self._process != os.getpid():  # a context does not survive a fork
             self._open()
         mujoco.mjv_updateScene(
@@ -118,7 +118,7 @@ class Renderer:
                     mujoco.mjr_uploadHField(self._model, self._mjr, field_id)
 
     def close(self) -> None:
-        """Free the GL context; the next picture makes a new one."""
+        """Free the GL context; the next image makes a new one."""
         if self._finalizer is not None:
             self._finalizer()
             self._gl = self._mjr = self._finalizer = None
@@ -142,7 +142,7 @@ class Renderer:
 class View:
     """One camera of a model, with a renderer for each size of its pictures.
 
-    :param upright: turn the picture over if the camera hangs upside down
+    :param upright: flip the image if the camera is mounted upside down
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class View:
         return other
 
     def look(self, size: int) -> np.ndarray:
-        """Return the picture now: (size, size, 3) uint8."""
+        """Return the current image, (size, size, 3) uint8."""
         if size not in self._renderers:
             self._renderers[size] = self._new(size=size)
         return self._renderers[size].render()

@@ -72,7 +72,7 @@ class Robotics(Achieved):
     joints) 28 at the door, 26 with the hammer, 24 with the pen, 30 to relocate.
 
     ## Observation Space
-    `Box(0, 255, (image_size, image_size, 3), uint8)`: the picture after the last repeat, by the
+    `Box(0, 255, (image_size, image_size, 3), uint8)`: the image after the last repeat, by the
     environment's usual camera, goal markers included. Its own observation, flattened, with the
     goals, is in `info["state"]` with `state_in_info`.
 

@@ -12,18 +12,18 @@ StepResult = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 
 
 class Simulated(gym.Env):
-    """A task that observes the state and shows its picture by `look`.
+    """A task that observes the state and returns its image with `look`.
 
     Subclasses define `reset` and `step`, and set `view`.
 
     ## Arguments
     `gymnasium.make` takes these for every family:
 
-    - `image_size=64`: side of the observed picture.
+    - `image_size=64`: side of the observed image.
     - `action_repeat`: number of control steps in a step, whose rewards are summed; 2, and 1 for
       robotics.
     - `pad_action_to=None`: width to which actions are padded; `"suite"` is the suite's widest.
-    - `rendering="near"`: quality of the picture; `"exact"` has the simulator's own settings,
+    - `rendering="near"`: quality of the image; `"exact"` has the simulator's own settings,
       `"fast"` no shadows.
     - `camera`: name or number of a camera, -1 for the free camera, or attributes of the free
       camera as a dict, such as `{"distance": 3.0}`; the family has its default.
@@ -45,11 +45,11 @@ class Simulated(gym.Env):
         self._first_seed = seed
 
     def look(self, size: int) -> np.ndarray:
-        """Return the picture now: (size, size, 3) uint8."""
+        """Return the current image, (size, size, 3) uint8."""
         return self.view.look(size)
 
     def render(self) -> np.ndarray | None:
-        """Return the picture at 240 x 240."""
+        """Return the image at 240 x 240."""
         return None if self.render_mode is None else self.look(240)
 
     def close(self) -> None:

@@ -67,7 +67,7 @@ def usual_camera(env: Any, model: "mujoco.MjModel", data: "mujoco.MjData") -> "C
     Gymnasium's renderer takes a camera of the model, or else the free camera with the environment's
     own settings, looking at the middle of all shapes.
 
-    :param data: the pose whose middle is looked at; Gymnasium takes that of the first picture
+    :param data: the pose whose middle the camera looks at; Gymnasium uses that of the first image
     """
     renderer = getattr(env, "mujoco_renderer", None)
     if renderer is None:

@@ -113,18 +113,18 @@ class SeePixels(gym.Wrapper, RecordConstructorArgs):
         self.observation_space = spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode and return its first picture."""
+        """Start an episode and return its first image."""
         state, info = self.env.reset(**kwargs)
         return self._seen(state, info)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Take a step and return the picture after it."""
+        """Take a step and return the image after it."""
         state, reward, terminated, truncated, info = self.env.step(action)
         image, info = self._seen(state, info)
         return image, float(reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Return the last picture, at `render_size`."""
+        """Return the last image, at `render_size`."""
         if self.render_mode is None:
             return None
         if self._render_size == self._image_size and self._image is not None:

@@ -72,7 +72,7 @@ def read_steps(data: bytes, source: str) -> dict[str, Any]:
             if name.startswith("steps/"):
                 steps |= {name[6:]: _values(*field) for field in _fields(feature)}
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise ValueError(f"{source} is damaged or not a tf.train.Example: {error}") from error
+        raise ValueError(f"{source} is damaged or no tf.train.Example: {error}") from error
     if not steps:
         raise ValueError(f"{source} has no 'steps/...': it is not an RLDS episode")
     return steps

@@ -137,7 +137,7 @@ class NpzEpisodes(Episodes):
                 )
         if arrays.get("is_first", np.zeros(1))[1:].any():
             raise ValueError(
-                f"{file} contains parts of several episodes (is_first), as DreamerV3's chunks do; "
+                f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
                 "write one file per episode"
             )
         return key

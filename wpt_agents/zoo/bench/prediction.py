@@ -178,7 +178,7 @@ def train(
     )
     if model.pretrain_steps > updates:
         raise ValueError(
-            f"{file} has {model.pretrain_steps} updates, not {updates}: pass as many, or "
+            f"{file} has had {model.pretrain_steps} updates, not {updates}: pass as many, or "
             f"delete {plan.folder}"
         )
     return model

@@ -96,7 +96,7 @@ def collect(
     dataset, total = _open(Path(path), description), len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
-            f"{path} has {dataset.appended} episodes, more than the {total} of this collection: "
+            f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
             "two processes have collected into it at once; delete it and collect again"
         )
     if dataset.appended == total:

@@ -814,7 +814,7 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
             mode = policy.actor.dist(post.feat[b : b + 1, t], policy.action_mask).mode[0].detach()
             error = (mode - torch.from_numpy(prior_action(policy, frames)[0]))[:2] ** 2
             by_hand += [error.mean().item()] * (t >= 2)
-    loss = model.learner.imitation_loss(post, model.learner.advice(batch))
+    loss = model.learner.imitation_loss(model.policy.actor, post, model.learner.advice(batch))
     assert model.num_timesteps == 50  # half way from 20 to 0
     assert model.hyperparameters.kickstart_at(50) == 10
     assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-4)
@@ -853,7 +853,7 @@ def test_the_loss_of_the_states_is_the_weighted_imitation_and_leaves_the_actor_f
     advice = model.learner.advice(batch)
     deter = post.deter.requires_grad_()
     loss = model.learner.states_loss(post._replace(deter=deter), advice)
-    assert loss.item() == pytest.approx(7 * model.learner.imitation_loss(post, advice).item())
+    assert loss.item() == pytest.approx(7 * model.learner.imitation_loss(model.policy.actor, post, advice).item())
     model.policy.actor.zero_grad()
     loss.backward()
     assert deter.grad.abs().sum() > 0
@@ -870,7 +870,7 @@ def test_a_kickstarted_actor_comes_to_act_as_the_prior_actor(store):
             **{"actor_critic_learning_rate": 3e-3, "bc_steps": 30, "return_norm": True},
         ).learn(4 * LENGTH)
         post, batch = replayed(model)
-        loss = model.learner.imitation_loss(post, model.learner.advice(batch))
+        loss = model.learner.imitation_loss(model.policy.actor, post, model.learner.advice(batch))
         distances.append(loss.item())
     assert distances[1] < 0.2 * distances[0]
 

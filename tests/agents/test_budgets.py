@@ -171,6 +171,6 @@ def test_the_table_of_the_docs_holds_the_values_of_the_sizes():
     rows = {**{name: name for name in TABLE_2 if name != "guidance"}, "pretrain_steps": "steps"}
     for field, title in rows.items():
         [line] = [line for line in page.splitlines() if line.startswith(f"| `{title}`")]
-        shown = [cell.strip() for cell in line.strip("|").split("|")][2:]  # name and unit come first
+        shown = [cell.strip() for cell in line.strip("|").split("|")][2:]  # after name and unit
         expected = [f"{getattr(SIZES[name], field):,}" for name in names]
         assert [cell.split(", ")[0].split("; ")[0] for cell in shown] == expected, line

@@ -853,7 +853,9 @@ def test_the_loss_of_the_states_is_the_weighted_imitation_and_leaves_the_actor_f
     advice = model.learner.advice(batch)
     deter = post.deter.requires_grad_()
     loss = model.learner.states_loss(post._replace(deter=deter), advice)
-    assert loss.item() == pytest.approx(7 * model.learner.imitation_loss(model.policy.actor, post, advice).item())
+    actor = model.policy.actor
+    expected = 7 * model.learner.imitation_loss(actor, post, advice).item()
+    assert loss.item() == pytest.approx(expected)
     model.policy.actor.zero_grad()
     loss.backward()
     assert deter.grad.abs().sum() > 0

@@ -1,9 +1,11 @@
 """A debug-sized agent, recorded episodes and a clock to step, for the tests of the algorithm."""
 
+from collections import defaultdict
+
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from toy_env import DotEnv
+from toy_env import LENGTH, DotEnv
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import Trajectory
@@ -94,3 +96,21 @@ def weights(model, *names):
 
 def same(one, other):
     return one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)
+
+
+def assert_goes_on_exactly(model, data, folder):
+    """Save and load an agent and its replay; both must then learn and act exactly alike."""
+    model.save(folder / "model")
+    model.save_replay_buffer(folder / "replay")
+    loaded = WPT.load(folder / "model", env=DotEnv(), dataset=data)
+    loaded.load_replay_buffer(folder / "replay")
+    for one in (model, loaded):
+        one.env.seed(7)
+        one._last_obs = None
+        one.learn(2 * LENGTH, reset_num_timesteps=False)
+        one.update(defaultdict(list))
+    assert same(weights(model), weights(loaded))
+    episodes = (one.replay_buffer.trajectories for one in (model, loaded))
+    for ours, theirs in zip(*episodes, strict=True):
+        np.testing.assert_array_equal(ours.action, theirs.action)
+    return loaded

@@ -1,14 +1,11 @@
 """IBRL: the actor's action or the clone's, by the value of where it leads."""
 
-from collections import defaultdict
-
 import numpy as np
 import pytest
 import torch
-from debug_agent import agent, noise, pretrained, recorded, same, weights
+from debug_agent import agent, assert_goes_on_exactly, noise, pretrained, recorded
 from toy_env import LENGTH, DotEnv
 
-from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.model import choosing
 from wpt_agents.model.choosing import choose_by_value, value_of_action
@@ -118,19 +115,5 @@ def test_the_choice_can_begin_and_end_within_an_episode(data):
 
 
 def test_an_interrupted_run_goes_on_exactly(data, tmp_path):
-    model = cloned(data, warmup_steps=0, guidance=0.0)
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "replay")
-    loaded = WPT.load(tmp_path / "model", env=DotEnv(), dataset=data)
-    loaded.load_replay_buffer(tmp_path / "replay")
+    loaded = assert_goes_on_exactly(cloned(data, warmup_steps=0, guidance=0.0), data, tmp_path)
     assert loaded.policy.ibrl
-    for one in (model, loaded):
-        one.env.seed(7)
-        one._last_obs = None
-        one.learn(2 * LENGTH, reset_num_timesteps=False)
-        one.update(defaultdict(list))
-    assert same(weights(model), weights(loaded))
-    for ours, theirs in zip(
-        model.replay_buffer.trajectories, loaded.replay_buffer.trajectories, strict=True
-    ):
-        np.testing.assert_array_equal(ours.action, theirs.action)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from debug_agent import agent, noise, pretrained, recorded, same, weights
+from debug_agent import agent, assert_goes_on_exactly, noise, pretrained, recorded, same, weights
 from toy_env import LENGTH, DotEnv
 
 from wpt_agents.agents.wpt import WPT
@@ -95,19 +95,5 @@ def test_without_a_clone_the_actor_acts(data):
 
 
 def test_an_interrupted_run_goes_on_exactly(data, tmp_path):
-    model = learned(data)
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "replay")
-    loaded = WPT.load(tmp_path / "model", env=DotEnv(), dataset=data)
-    loaded.load_replay_buffer(tmp_path / "replay")
+    loaded = assert_goes_on_exactly(learned(data), data, tmp_path)
     assert loaded.policy.residual
-    for one in (model, loaded):
-        one.env.seed(7)
-        one._last_obs = None
-        one.learn(2 * LENGTH, reset_num_timesteps=False)
-        one.update(defaultdict(list))
-    assert same(weights(model), weights(loaded))
-    for ours, theirs in zip(
-        model.replay_buffer.trajectories, loaded.replay_buffer.trajectories, strict=True
-    ):
-        np.testing.assert_array_equal(ours.action, theirs.action)

@@ -231,6 +231,15 @@ def test_every_method_can_be_planned_from_every_preset(method, tmp_path):
         assert run.config() and run.folder and run.shared.model_path
 
 
+@pytest.mark.parametrize("preset", ["demo", "mid"])
+def test_only_wpt_starts_from_the_world_model_of_the_library(preset, tmp_path):
+    [ours] = plan("metaworld", ["reach"], preset, tmp_path, "wpt")
+    [r3m] = plan("metaworld", ["reach"], preset, tmp_path, "r3m")
+    assert ours.shared.shipped == "metaworld-mid"
+    assert r3m.algorithm.pretrained
+    assert not r3m.shared.shipped
+
+
 @pytest.mark.parametrize("name", ["wpt/metaworld-reach-v0", "metaworld-reach", "reach"])
 def test_baselines_use_data_of_their_task_also_where_imported_data_call_it_otherwise(
     name, tmp_path

@@ -29,7 +29,7 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
         console.print(f"dataset      {state}  [dim]{path}")
     models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
     for path, shared in models.items():
-        if ships := shared.preset.pretrain.model:
+        if ships := shared.shipped:
             console.print(f"world model  {ships}, which ships")
             continue
         updates = counted(shared.preset.pretrain.steps, "update")

@@ -68,6 +68,11 @@ class Shared:
         return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
 
     @property
+    def shipped(self) -> str:
+        """The model of the library that replaces pre-training, or "": they are all WPT's."""
+        return self.preset.pretrain.model if self.agent is WPT else ""
+
+    @property
     def model_path(self) -> Path:
         """The folder of the pre-training: the model, its log, and `done.json` once it finished."""
         parts = [asdict(self.preset.pretrain), self.pretraining, self.data_source]

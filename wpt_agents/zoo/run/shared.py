@@ -77,7 +77,7 @@ def _warn_of_differences(shared: Shared) -> None:
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: pre-train the model unless it is finished, and return its file."""
-    if name := shared.preset.pretrain.model:
+    if name := shared.shipped:
         say("pretrain", f"the shipped model {name}  [dim]{shipped_model(name)}")
         return shipped_model(name)
     folder = shared.model_path

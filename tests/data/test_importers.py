@@ -137,6 +137,34 @@ def test_npz_actions_lead_the_observation_and_are_shifted_back(tmp_path, key, ov
     assert (new.embodiment, new.source) == ("walker", "20240101T000000-ab-0-20.npz")
 
 
+def test_npz_with_an_image_more_than_actions_has_our_timing(tmp_path):
+    old = chain(5, terminated=True)
+    path = tmp_path / "0.npz"
+    over = np.arange(5) == 4
+    np.savez(path, image=old.image, action=old.action, reward=old.reward, is_terminal=over)
+    [new] = open_episodes(tmp_path, **SMALL)
+    check_same(new, old)
+    np.savez(path, image=old.image, action=old.action, reward=np.zeros(6))
+    with pytest.raises(ValueError, match="has 6 rewards for 5 actions"):
+        open_episodes(tmp_path, **SMALL)[0]
+
+
+def test_a_first_action_in_npz_that_is_no_placeholder_is_asked_about(tmp_path):
+    old = chain(5, terminated=True)
+    path = tmp_path / "0.npz"
+    over = np.arange(5) == 4
+    np.savez(path, image=old.image[:-1], action=old.action, reward=old.reward, is_terminal=over)
+    with pytest.raises(ValueError, match=r"0\.npz.* here it is not: pass shifted=True if it did "):
+        open_episodes(tmp_path, **SMALL)[0]
+    [taken] = open_episodes(tmp_path, shifted=False, **SMALL)
+    np.testing.assert_array_equal(taken.action, old.action[:4])
+    np.testing.assert_array_equal(taken.image, old.image[:5])
+    np.testing.assert_allclose(taken.reward, old.reward[:4])
+    assert not taken.terminated  # what the last action led to is not there
+    [led] = open_episodes(tmp_path, shifted=True, **SMALL)
+    np.testing.assert_array_equal(led.action, old.action[1:])
+
+
 def test_npz_actions_are_rescaled_from_the_limits_given(tmp_path):
     old = chain(5)
     large = replace(old, action=old.action / 4)  # in [-1/4, 1/4]
@@ -204,7 +232,7 @@ def test_a_truncated_npz_is_named(tmp_path, share):
     ("arrays", "culprit"),
     [
         ({"observation": np.zeros((4, 24), np.float32), "action": np.zeros((4, 2))}, "render"),
-        ({"pixels": np.zeros((4, 8, 8, 3), np.uint8), "action": np.zeros((3, 2))}, "equally many"),
+        ({"pixels": np.zeros((4, 8, 8, 3), np.uint8), "action": np.zeros((2, 2))}, "equally many"),
         (
             {
                 "image": np.zeros((4, 8, 8, 3), np.uint8),
@@ -214,7 +242,13 @@ def test_a_truncated_npz_is_named(tmp_path, share):
             "parts of several episodes",
         ),
         ({"state": np.zeros(3)}, "holds state; an episode needs 'action' and one of observation"),
-        ({"image": np.zeros((4, 8, 8, 3), np.uint8), "action": np.full((4, 2), 9.0)}, "rescale"),
+        (
+            {
+                "image": np.zeros((4, 8, 8, 3), np.uint8),
+                "action": np.array([[0, 0], [9, 9], [9, 9], [9, 9.0]]),
+            },
+            "rescale",
+        ),
     ],
 )
 def test_an_npz_of_something_else_is_named_with_the_reason(tmp_path, arrays, culprit):

@@ -1,7 +1,8 @@
 """`.npz` files: one per episode (ExORL, URLB, DrQ-v2, the official NCRL data, Dreamer), or rows.
 
 In a file per episode, arrays have length T + 1, and action t is the one that *led to* observation
-t: the first action and reward are placeholders. So our action t is their action t + 1.
+t: the first action and reward are placeholders. So our action t is their action t + 1. If there are
+only T actions for T + 1 images, their timing is ours.
 
 In a file of rows (OGBench), flags such as `terminals` say where episodes end; action t was taken at
 observation t. Such files are read row by row, never as a whole.
@@ -32,12 +33,17 @@ class NpzEpisodes(Episodes):
     """The episodes of a `.npz` file, or of all files below a folder, sorted by name.
 
     :param folder: searched for `.npz` files; those without actions and images are skipped
+    :param shifted: whether row t holds the action that led to image t, instead of the one that was
+        taken at it; by default it did, and a first action that is no placeholder is refused
     :param options: those of `Episodes`
     """
 
-    def __init__(self, folder: str | os.PathLike[str], **options: Any) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], shifted: bool | None = None, **options: Any
+    ) -> None:
         super().__init__(**options)
         path = Path(folder)
+        self._shifted = shifted
         self._folder = path.parent if path.is_file() else path
         self._image_keys = (self.image_key,) if self.image_key else IMAGE_KEYS
         self._action_keys = self.action_keys or ("action",)
@@ -46,7 +52,7 @@ class NpzEpisodes(Episodes):
             raise ValueError(f"{folder} holds no .npz file")
         kinds = {file: self._kind(file) for file in files}
         self._files = [file for file, kind in kinds.items() if kind == "episode"]
-        self._flat = FlatNpz(path, **options) if "flat" in kinds.values() else None
+        self._flat = FlatNpz(path, shifted, **options) if "flat" in kinds.values() else None
         strange = [file for file, kind in kinds.items() if kind == "other"]
         if strange and (self._files or self._flat):
             warnings.warn(
@@ -71,7 +77,7 @@ class NpzEpisodes(Episodes):
             actions = [key for key in self._action_keys if key in names]
             if not images and not actions:
                 return "other"
-            if actions and len(arrays_of(file, set(actions)).get(actions[0], ())) == 1:
+            if actions and len(arrays_of(file, set(actions)).get(actions[0], ())) <= 1:
                 lengths = {len(array) for array in arrays_of(file, set(images)).values()}
                 return "single" if lengths == {1} else "episode"
         except (ValueError, TypeError):  # TypeError: a number in place of an array
@@ -88,22 +94,43 @@ class NpzEpisodes(Episodes):
         keys = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
         arrays = arrays_of(file, keys)
         key = self._check(file, arrays)
+        images = len(arrays[key])
+        led_to = self._led_to(file, arrays, images)
+        taken = slice(1, None) if led_to else slice(images - 1)
         # dm_env marks a terminal state by a discount of 0, and a time limit by 1
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         if self.done_key is not None:
             over = arrays[self.done_key]
+        # Where the last action is dropped, what it led to is not seen.
+        seen = led_to or len(arrays[self._action_keys[0]]) < images
         return self._trajectory(
             arrays[key],
-            self._actions(arrays),
-            arrays["reward"][1:] if "reward" in arrays else None,
+            self._actions(arrays, taken),
+            arrays["reward"][taken] if "reward" in arrays else None,
             source=file.relative_to(self._folder).as_posix(),
-            terminated=bool(np.ravel(over)[-1] == 1),
+            terminated=seen and bool(np.ravel(over)[-1] == 1),
             **self._labels(file),
         )
 
-    def _actions(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the actions without the placeholder; several arrays are concatenated."""
-        actions = [np.asarray(arrays[name][1:]) for name in self._action_keys]
+    def _led_to(self, file: Path, arrays: dict[str, np.ndarray], images: int) -> bool:
+        """Return whether each action led to the image of its row.
+
+        :raises ValueError: if the first action should be a placeholder but is not
+        """
+        actions = [arrays[name] for name in self._action_keys]
+        if len(actions[0]) < images:
+            return False
+        if self._shifted is None and any(np.nan_to_num(action[0]).any() for action in actions):
+            raise ValueError(
+                f"{file}: in this format the action of a row led to its image, and the first "
+                "action of an episode is zero, but here it is not: pass shifted=True if it did "
+                "(--shifted), or shifted=False if the action was taken at the image (--no-shifted)"
+            )
+        return self._shifted is not False
+
+    def _actions(self, arrays: dict[str, np.ndarray], taken: slice) -> np.ndarray:
+        """Return the actions between the images; several arrays are concatenated."""
+        actions = [np.asarray(arrays[name][taken]) for name in self._action_keys]
         if len(actions) == 1:
             return actions[0]
         return np.concatenate([a.reshape(len(a), -1) for a in actions], axis=1)
@@ -129,12 +156,17 @@ class NpzEpisodes(Episodes):
                 f"{', '.join(map(repr, needed))} and one of {', '.join(self._image_keys)}; name "
                 "them by image_key and action_key (--image-key, --action-key)"
             )
-        for name in self._action_keys:
-            if arrays[name].shape[:1] != arrays[key].shape[:1]:
-                raise ValueError(
-                    f"{file} has {arrays[name].shape[0]} actions for {len(arrays[key])} images; in "
-                    "this format they are equally many, and the first action is a placeholder"
-                )
+        images = len(arrays[key])
+        counts = {len(np.atleast_1d(arrays[name])) for name in self._action_keys}
+        if counts not in ({images}, {images - 1}):
+            raise ValueError(
+                f"{file} has {' and '.join(map(str, sorted(counts)))} actions for {images} images; "
+                "in this format they are equally many, and the first action is a placeholder, or "
+                "there is one action fewer"
+            )
+        rewards = len(np.atleast_1d(arrays.get("reward", ())))
+        if self.rewards and "reward" in arrays and {rewards} != counts:
+            raise ValueError(f"{file} has {rewards} rewards for {max(counts)} actions")
         if arrays.get("is_first", np.zeros(1))[1:].any():
             raise ValueError(
                 f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "

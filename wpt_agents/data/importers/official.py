@@ -30,7 +30,7 @@ class OfficialEpisodes(NpzEpisodes):
                 f"{folder} is not the authors' data: its path has neither {DMC!r} nor "
                 f"{METAWORLD!r}, whose folders name the robots and tasks; import it as npz"
             )
-        super().__init__(folder, **options)
+        super().__init__(folder, shifted=True, **options)
 
     def _kind(self, file: Path) -> str:
         length = file.stem.rpartition("-")[2]  # avoids opening tens of thousands of files
@@ -38,8 +38,8 @@ class OfficialEpisodes(NpzEpisodes):
             return super()._kind(file)
         return "episode" if int(length) > 0 else "single"
 
-    def _actions(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
-        return super()._actions(arrays).clip(-1, 1)
+    def _actions(self, arrays: dict[str, np.ndarray], taken: slice) -> np.ndarray:
+        return super()._actions(arrays, taken).clip(-1, 1)
 
     def _limits_of(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         ones = np.ones(action.shape[1])

@@ -48,7 +48,7 @@ Shifted = Annotated[
     bool | None,
     typer.Option(
         "--shifted/--no-shifted",
-        help="For hdf5 and zarr: the action of a row led to its observation (--shifted, as in "
+        help="For hdf5, npz and zarr: the action of a row led to its observation (--shifted, as in "
         "dm_env), or was taken at it (--no-shifted). By default the format decides.",
     ),
 ]

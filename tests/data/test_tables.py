@@ -144,6 +144,44 @@ def test_flat_rows_end_where_any_of_the_usual_flags_says(tmp_path, flags):
         check(episode, expected, len(expected))
 
 
+@pytest.mark.parametrize("flags", ["terminations", "dones", "step_type", "episode_ends"])
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_one_episode_with_flags_and_an_image_more_than_actions_is_whole(tmp_path, flags, suffix):
+    old = chain(5, 0, terminated=flags == "terminations")
+    over = {"step_type": 2 * last([old]), "episode_ends": [5]}.get(flags, last([old]))
+    arrays = {"observations": old.image, "actions": old.action, flags: np.asarray(over)}
+    path = tmp_path / f"a.{suffix}"
+    np.savez(path, **arrays) if suffix == "npz" else save(path, arrays)
+    [new] = open_episodes(path, **SMALL)
+    check(new, old)
+    assert new.terminated == old.terminated
+    arrays[flags] = np.array([3, 5] if flags == "episode_ends" else [0, 2, 0, 0, 2])
+    np.savez(path, **arrays) if suffix == "npz" else save(path, arrays)
+    with pytest.raises(ValueError, match="in files of many episodes they must be equally many"):
+        open_episodes(path, **SMALL)
+
+
+def test_an_empty_demo_of_robomimic_is_left_out(tmp_path):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        for i, t in enumerate([chain(5, 0), chain(5, 1)]):
+            rows = len(t) * (i == 0)
+            file[f"data/demo_{i}/actions"] = t.action[:rows]
+            file[f"data/demo_{i}/obs/agentview_image"] = t.image[:rows]
+            file[f"data/demo_{i}/next_obs/agentview_image"] = t.image[1 : rows + 1]
+    with pytest.warns(UserWarning, match="1 episode of a single image left out"):
+        [new] = open_episodes(tmp_path / "a.hdf5", **SMALL)
+    check(new, chain(5, 0))
+
+
+def test_the_flag_of_a_terminal_state_in_groups_is_named_by_done_key(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(5)])
+    for key, over in ((None, False), ("dones", True), ("data/demo_0/dones", True)):
+        [new] = open_episodes(tmp_path / "a.hdf5", done_key=key, **SMALL)
+        assert new.terminated == over
+    with pytest.raises(ValueError, match="in data/demo_0: there is no array 'over'; there are: "):
+        open_episodes(tmp_path / "a.hdf5", done_key="over", **SMALL)
+
+
 def test_a_flag_of_another_name_is_named_by_done_key(tmp_path):
     old = [chain(5, 0), chain(7, 1)]
     path = save(tmp_path / "a.hdf5", rows(old) | {"episode_over": last(old)})
@@ -202,6 +240,51 @@ def test_rows_of_step_types_without_placeholders_are_asked_about(tmp_path):
     check(open_episodes(path, shifted=True, **SMALL)[0], chain(5, 0))
     unshifted = open_episodes(path, shifted=False, **SMALL)[0]
     assert unshifted.action[0].tolist() == [0.5, 0.5]
+
+
+def save_dreamer(path, trajectories, marked=True):
+    """PyDreamer's: row t holds the action that led to image t, and whether image t is terminal."""
+    rows = [len(t) + 1 for t in trajectories]
+    blank = np.zeros((1, 2), np.float32)
+    arrays = {
+        "image": np.concatenate([t.image for t in trajectories]),
+        "action": np.concatenate([a for t in trajectories for a in (blank, t.action)]),
+        "reward": np.concatenate([[0, *t.reward] for t in trajectories]),
+        "terminal": np.concatenate([np.arange(n) == n - 1 for n in rows]),
+    }
+    reset = {"reset": np.concatenate([np.arange(n) == 0 for n in rows])}
+    np.savez(path, **arrays, **(reset if marked else {}))
+
+
+def test_rows_of_dreamer_are_shifted_back(tmp_path):
+    old = [chain(5, 0, terminated=True), chain(7, 1, terminated=True)]
+    save_dreamer(tmp_path / "a.npz", old)
+    for new, expected in zip(open_episodes(tmp_path, rewards=True, **SMALL), old, strict=True):
+        check(new, expected)
+        np.testing.assert_allclose(new.reward, expected.reward)
+        assert new.terminated
+
+
+def test_rows_whose_episodes_all_begin_with_a_zero_action_are_questioned(tmp_path, recwarn):
+    old = [chain(5, 0), chain(7, 1)]
+    save_dreamer(tmp_path / "a.npz", old, marked=False)
+    with pytest.warns(UserWarning, match=r"first action of every episode is zero.* shifted=True"):
+        assert len(open_episodes(tmp_path, **SMALL)) == 2
+    recwarn.clear()
+    for new, expected in zip(open_episodes(tmp_path, shifted=True, **SMALL), old, strict=True):
+        check(new, expected)
+    taken = open_episodes(tmp_path, shifted=False, **SMALL)[0]
+    assert not taken.action[0].any()
+    assert not recwarn
+
+
+def test_the_timing_of_step_types_can_be_told_for_npz_too(tmp_path):
+    old = chain(5, 0)
+    steps = {"action": old.action, "step_type": [0, 1, 1, 1, 2]}
+    np.savez(tmp_path / "a.npz", observation=old.image[:-1], **steps)
+    with pytest.raises(ValueError, match="shifted=True if"):
+        open_episodes(tmp_path / "a.npz", **SMALL)
+    check(open_episodes(tmp_path / "a.npz", shifted=False, **SMALL)[0], old, 5)
 
 
 def test_actions_in_several_arrays_are_put_side_by_side_in_the_order_of_the_keys(tmp_path):

@@ -30,6 +30,7 @@ class Keys:
     actions: tuple[str, ...]
     reward: str | None
     next_image: str | None
+    terminal: str | None  # the flag that marks a terminal state
     others: tuple[str, ...] = field(default=(), compare=False)  # cameras that were not chosen
 
 
@@ -63,12 +64,21 @@ def is_images(array: Any) -> bool:
     return len(array.shape) == 4 or (len(array.shape) == 3 and array.dtype == np.uint8)
 
 
-def find_keys(table: Table, image_key: str | None, action_keys: tuple[str, ...]) -> Keys:
+def find_keys(
+    table: Table,
+    image_key: str | None,
+    action_keys: tuple[str, ...],
+    terminal_key: str | None = None,
+) -> Keys:
     """Find images, actions and rewards by the user's keys, or by the usual words.
 
+    :param terminal_key: the flag that marks a terminal state
     :raises ValueError: if they are missing or ambiguous; lists the arrays
     """
     image, others = _find_images(table, image_key)
+    terminal = first(TERMINAL, table) if terminal_key is None else match(terminal_key, table)
+    if terminal_key is not None and terminal is None:
+        raise ValueError(f"there is no array {terminal_key!r}; there are: {', '.join(table)}")
     head, _, tail = image.partition("/")
     next_image = f"next_{head}/{tail}" if tail else f"next_{head}"
     return Keys(
@@ -76,6 +86,7 @@ def find_keys(table: Table, image_key: str | None, action_keys: tuple[str, ...])
         find_actions(table, action_keys),
         first(REWARDS, table),
         next_image if next_image in table else None,
+        terminal,
         others,
     )
 

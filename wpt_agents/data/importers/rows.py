@@ -1,9 +1,10 @@
 """Arrays of rows that are split into episodes, for HDF5, .npz and zarr files.
 
-Row t holds observation t and the action taken at it, unless the file is in dm_env's convention
-(`step_type`), where row t holds the action that *led to* observation t and an episode's first
-action is a placeholder. The observation after an episode's last action exists only if there is also
-an array `next_...` of images; without it that action is dropped, and no terminal state is seen.
+Row t holds observation t and the action taken at it, unless the file is in the convention of dm_env
+(`step_type`) or Dreamer (`is_first`, `reset`), where row t holds the action that *led to*
+observation t and an episode's first action is a placeholder. The observation after an episode's
+last action exists only if there is also an array `next_...` of images, or one image more than
+actions; without it that action is dropped, and no terminal state is seen.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ import numpy as np
 from wpt_agents.data.importers import keys
 from wpt_agents.data.importers.keys import Keys, Table, count, first
 
-FIRST, LAST = 0, 2  # dm_env's step types
+LAST = 2  # dm_env's step type
+MARKS = ("step_type", "is_first", "reset")  # of files whose actions led to their observation
+EXAMINED = 100  # episodes whose first actions are read
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,13 @@ class Cut:
     :param bounds: the first row of each episode and one past its last
     :param shifted: whether row t holds the action that led to observation t
     :param left_out: the number of episodes that are too short to contain an action
+    :param doubtful: whether `shifted` is False although each episode begins with a zero action
     """
 
     bounds: tuple[tuple[int, int], ...]
     shifted: bool
     left_out: int
+    doubtful: bool
 
 
 def length(table: Table, columns: Keys) -> int:
@@ -53,9 +58,7 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
     :raises ValueError: if there is no such flag, or the timing of `step_type` is ambiguous
     """
     rows = length(table, columns)
-    names = [done_key] if done_key is not None else [n for n in keys.ENDS if n in table]
-    if done_key is not None and done_key not in table:
-        raise ValueError(f"there is no array {done_key!r}; there are: {', '.join(table)}")
+    names = _flags(table, done_key)
     if not names:
         raise ValueError(
             "nothing says where episodes end: needs 'terminals', 'timeouts', 'terminations', "
@@ -64,12 +67,36 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
         )
     ends = np.concatenate([_ends(np.ravel(table[name][:]), name, rows) for name in names])
     edges = np.unique(np.concatenate([[0], ends, [rows]]).astype(int)).tolist()
+    doubtful = False
     if shifted is None:
-        shifted = "step_type" in names and _first_actions_are_empty(table, columns, edges)
+        empty, acts = _beginnings(table, columns, edges[:-1])
+        shifted = _led_to(table, empty)
+        doubtful = empty and acts and not shifted
     # without a next image the outcome of an episode's last action is unknown
     shortest = 1 if columns.next_image and not shifted else 2
     bounds = tuple((a, b) for a, b in pairwise(edges) if b - a >= shortest)
-    return Cut(bounds, shifted, len(edges) - 1 - len(bounds))
+    return Cut(bounds, shifted, len(edges) - 1 - len(bounds), doubtful)
+
+
+def is_one_episode(table: Table, columns: Keys, done_key: str | None) -> bool:
+    """Return whether there is one more image than actions, and no flag before the end."""
+    rows = count(table[columns.actions[0]])
+    if count(table[columns.image]) != rows + 1:
+        return False
+    flags = {name: np.ravel(table[name][:]) for name in _flags(table, done_key)}
+    return not any((_flagged(array, name) < rows).any() for name, array in flags.items())
+
+
+def _flags(table: Table, done_key: str | None) -> list[str]:
+    """Return the names of the flags that mark the ends of episodes.
+
+    :raises ValueError: if the user's is not there
+    """
+    if done_key is None:
+        return [name for name in keys.ENDS if name in table]
+    if done_key not in table:
+        raise ValueError(f"there is no array {done_key!r}; there are: {', '.join(table)}")
+    return [done_key]
 
 
 def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
@@ -81,21 +108,41 @@ def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
                 "numbers at which episodes end"
             )
         return flags
-    if keys.leaf(name) == "step_type":
-        return np.flatnonzero(flags == LAST) + 1
-    return np.flatnonzero(flags) + 1
+    return _flagged(flags, name)
 
 
-def _first_actions_are_empty(table: Table, columns: Keys, edges: list[int]) -> bool:
-    """Return whether every episode's first action is a placeholder, as in dm_env's convention."""
-    action = read_actions(table, columns, 0, edges[-1])[edges[:-1]]
-    if not np.nan_to_num(action).any():
-        return True
-    raise ValueError(
-        "'step_type' comes from dm_env, where the action of a row led to its observation and the "
-        "first action of an episode is zero, but here it is not: pass shifted=True if it did "
-        "(--shifted), or shifted=False if the action was taken at the observation (--no-shifted)"
-    )
+def _flagged(flags: np.ndarray, name: str) -> np.ndarray:
+    """Return one past each flagged row."""
+    if keys.leaf(name) == "episode_ends":
+        return flags
+    return np.flatnonzero(flags == LAST if keys.leaf(name) == "step_type" else flags) + 1
+
+
+def _beginnings(table: Table, columns: Keys, starts: list[int]) -> tuple[bool, bool]:
+    """Return whether the first actions of episodes are all zero or NaN, and if second ones are not.
+
+    :param starts: the first row of each episode
+    """
+    pairs = [read_actions(table, columns, row, row + 2) for row in starts[:EXAMINED]]
+    if any(pair.dtype.kind not in "fiub" for pair in pairs):
+        return False, False  # no numbers, which are refused later
+    empty = not any(np.nan_to_num(pair[:1]).any() for pair in pairs)
+    return empty, any(np.nan_to_num(pair[1:]).any() for pair in pairs)
+
+
+def _led_to(table: Table, empty: bool) -> bool:
+    """Return whether the action of a row led to its observation, if the user has not decided.
+
+    :param empty: whether the first actions of episodes are zero, as placeholders are
+    """
+    if "step_type" in table and not empty:
+        raise ValueError(
+            "'step_type' comes from dm_env, where the action of a row led to its observation and "
+            "the first action of an episode is zero, but here it is not: pass shifted=True if it "
+            "did (--shifted), or shifted=False if the action was taken at the observation "
+            "(--no-shifted)"
+        )
+    return empty and first(MARKS, table) is not None
 
 
 def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarray:
@@ -114,14 +161,20 @@ def episode(
     action = read_actions(table, columns, start, stop)
     reward = None if columns.reward is None else np.asarray(table[columns.reward][start:stop])
     if shifted:
-        over = "discount" in table and not np.any(table["discount"][stop - 1 : stop])
+        over = _is_flagged(table, columns, stop - 1)
+        if "discount" in table:
+            over = not np.any(table["discount"][stop - 1 : stop])
         return image, action[1:], None if reward is None else reward[1:], over
     if columns.next_image is None:
         return image, action[:-1], None if reward is None else reward[:-1], False
     last = np.asarray(table[columns.next_image][stop - 1 : stop])
-    flag = first(keys.TERMINAL, table)
-    over = flag is not None and bool(np.any(table[flag][stop - 1 : stop]))
+    over = _is_flagged(table, columns, stop - 1)
     return np.concatenate([image, last]), action, reward, over
+
+
+def _is_flagged(table: Table, columns: Keys, row: int) -> bool:
+    """Return whether a row is marked as leading to a terminal state."""
+    return columns.terminal is not None and bool(np.any(table[columns.terminal][row : row + 1]))
 
 
 def whole(
@@ -132,8 +185,8 @@ def whole(
     images = count(table[columns.image])
     if images == rows + 1:
         reward: Any = None if columns.reward is None else np.asarray(table[columns.reward][:rows])
-        flag = first(keys.TERMINAL, table)
-        over = flag is not None and bool(np.any(table[flag][rows - 1 : rows]))
+        flags = 0 if columns.terminal is None else count(table[columns.terminal])
+        over = _is_flagged(table, columns, flags - 1)  # there may be a flag for each image
         image = np.asarray(table[columns.image][:])
         return image, read_actions(table, columns, 0, rows), reward, over
     if images != rows:

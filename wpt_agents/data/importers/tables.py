@@ -52,6 +52,7 @@ class TableEpisodes(Episodes):
         self._opened: tuple[Path, Table] | None = None
         self._places: list[Place] = []
         self._chosen: set[str] = set()
+        self._doubtful: list[bool] = []
         left_out = 0
         files = self._list(self._root)
         for file in files:
@@ -61,6 +62,13 @@ class TableEpisodes(Episodes):
                 name = "" if str(error).startswith(str(file)) else f"{file}: "
                 raise ValueError(f"{name}{error}") from error
         warn_left_out(left_out, path)
+        if self._doubtful and all(self._doubtful):
+            warnings.warn(
+                f"{path}: the first action of every episode is zero. If it is a placeholder, the "
+                "action of a row led to its observation, and shifted=True (--shifted) is needed; "
+                "shifted=False (--no-shifted) confirms that it was taken at the observation",
+                stacklevel=2,
+            )
 
     def _list(self, path: Path) -> Sequence[Path]:
         """Return the files to read.
@@ -94,27 +102,28 @@ class TableEpisodes(Episodes):
         keys = find_keys(table, self.image_key, self.action_keys)
         self._say_camera(keys)
         flags = self.done_key is not None or first(ENDS, table) is not None
-        one_more = count(table[keys.image]) == count(table[keys.actions[0]]) + 1
-        alone = several or keys.image.startswith("observations/images/") or one_more
-        if not flags and alone:
+        alone = several or keys.image.startswith("observations/images/")
+        if (alone and not flags) or rows.is_one_episode(table, keys, self.done_key):
             self._places.append(Place(file, "", None, keys, self._shifted, task))
             return 0
         cut = rows.cut(table, keys, self.done_key, self._shifted)
         for bounds in cut.bounds:
             self._places.append(Place(file, "", bounds, keys, cut.shifted, task))
+        self._doubtful.append(cut.doubtful)
         return cut.left_out
 
     def _find_groups(self, file: Path, groups: dict[str, Table], task: str | None) -> int:
         image_key = None if self.image_key is None else within(self.image_key, groups)
         action_keys = tuple(within(key, groups) for key in self.action_keys)
+        done_key = None if self.done_key is None else within(self.done_key, groups)
         left_out = 0
         for group, table in groups.items():
             try:
-                keys = find_keys(table, image_key, action_keys)
+                keys = find_keys(table, image_key, action_keys, done_key)
             except ValueError as error:
                 raise ValueError(f"{file} in {group}: {error}") from error
             self._say_camera(keys)
-            if count(table[keys.image]) < 2 and keys.next_image is None:
+            if count(table[keys.image]) < (2 if keys.next_image is None else 1):
                 left_out += 1
             else:
                 self._places.append(Place(file, group, None, keys, self._shifted, task))

@@ -78,6 +78,16 @@ def test_the_page_shows_the_figure_and_what_is_missing(sequences, monkeypatch, t
     assert "Missing: packnet." in text((other / "index.html").read_text(encoding="utf-8"))
 
 
+def test_a_folder_of_sequences_alone_has_no_empty_tables(sequences, monkeypatch, capsys):
+    assert call(monkeypatch, "report", sequences) == 0
+    printed = capsys.readouterr().out
+    assert "packnet" in printed and "350" in printed and "paper at 150k" not in printed
+    written = (sequences / "report" / "report.md").read_text(encoding="utf-8")
+    assert "| after quadruped-walk | 300 | 400 |" in written
+    words = text((sequences / "report" / "index.html").read_text(encoding="utf-8"))
+    assert "1 sequence" in words and "Every policy" not in words and "seeds ;" not in words
+
+
 def test_a_sequence_that_is_not_finished_is_shown_as_far_as_it_is(sequences):
     make_sequence(sequences, "packnet", [[100.0]], seed=1)
     [figure] = figures_4(find_sequences(sequences))

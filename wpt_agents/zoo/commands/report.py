@@ -45,7 +45,12 @@ def report(
     """
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_page, tables
-    from wpt_agents.zoo.report.figure4 import find_sequences
+    from wpt_agents.zoo.report.figure4 import (
+        figures_4,
+        find_sequences,
+        sequence_markdown,
+        sequence_table,
+    )
     from wpt_agents.zoo.report.folders import find_finished, read_results
     from wpt_agents.zoo.report.page import write_page
     from wpt_agents.zoo.terminal import console
@@ -59,11 +64,13 @@ def report(
         record_page.write(record, kept)
         console.print(f"No finished run below {folder}: {record} stays, its pages are renewed.")
         return
-    if not results and not find_sequences(folder):
+    sequences = figures_4(find_sequences(folder))
+    if not results and not sequences:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows = tables.summarise(results)
     policies = tables.policies(results)
-    as_markdown = f"{tables.markdown(rows)}\n{tables.policy_markdown(policies)}"
+    parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
+    as_markdown = "\n".join([*parts, *([sequence_markdown(sequences)] if sequences else [])])
     if record is not None:
         lines = records.update(record, records.lines_of(find_finished(folder)))
         record_page.write(record, lines)
@@ -76,5 +83,8 @@ def report(
         write_page(folder, page, media)
         page.with_name("report.md").write_text(as_markdown, encoding="utf-8")
         page.with_name("policies.csv").write_text(tables.policy_csv(policies), encoding="utf-8")
-        console.print(tables.summary_table(rows))
+        if rows:
+            console.print(tables.summary_table(rows))
+        if sequences:
+            console.print(sequence_table(sequences))
         console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.markup import escape
+from rich.table import Table
 
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.report import figures
 from wpt_agents.zoo.report.sections import curve
+from wpt_agents.zoo.report.tables import markdown_table, number
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
 
 COMPARED = ("wpt", "packnet")
@@ -66,6 +69,34 @@ def figures_4(finished: Sequence[Finished]) -> list[Figure4]:
         key = result.sequence, str(result.variant), result.frames
         groups[key].append((path, result))
     return [_figure(*key, group) for key, group in groups.items()]
+
+
+def sequence_markdown(figures: Sequence[Figure4]) -> str:
+    """Return the matrices of all sequences as Markdown tables."""
+    parts = []
+    for figure in figures:
+        tasks = [task.replace("dmc-", "") for task in figure.tasks]
+        for matrix in figure.matrices:
+            lines = [
+                [f"after {task}", *map(number, row), *[""] * (len(tasks) - len(row))]
+                for task, row in zip(tasks, matrix.rows, strict=False)  # unfinished: fewer rows
+            ]
+            table = markdown_table([matrix.name, *tasks], lines)
+            mean = f"Mean return on the task being learned: {number(matrix.mean)}."
+            parts.append(f"### The sequence {figure.title}: {matrix.name}\n\n{table}\n{mean}\n")
+    return "\n".join(parts)
+
+
+def sequence_table(figures: Sequence[Figure4]) -> Table:
+    """Return the mean of each sequence and method as a table for a terminal."""
+    table = Table("sequence", "method", caption="mean over tasks of the return on the one learned")
+    for heading in ("seeds", "tasks", "mean"):
+        table.add_column(heading, justify="right")
+    for figure in figures:
+        for matrix in figure.matrices:
+            counts = str(len(matrix.seeds)), f"{len(matrix.rows)} of {len(figure.tasks)}"
+            table.add_row(escape(figure.title), matrix.name, *counts, number(matrix.mean))
+    return table
 
 
 def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finished]) -> Figure4:

@@ -827,7 +827,7 @@ def test_a_damaged_image_or_record_of_rlds_is_named(tmp_path):
     at = content.index(b"IDAT")
     content[at + 6 : at + 20] = bytes(14)
     (tmp_path / "a.tfrecord").write_bytes(content)
-    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12 has a damaged image"):
+    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12: image 0 is damaged"):
         open_episodes(tmp_path, **SMALL)[0]
     content[12] = 0x0F  # a field of a kind that does not exist
     (tmp_path / "a.tfrecord").write_bytes(content)

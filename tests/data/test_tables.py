@@ -3,12 +3,14 @@
 Each is written in its program's own layout, from a known chain, and must come back as the chain.
 """
 
+import io
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from chain import chain, follows
+from PIL import Image
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.importers.formats import open_episodes, recognise
@@ -91,6 +93,53 @@ def test_aloha_has_a_file_an_episode(tmp_path):
         check(episode, expected, len(expected))
     [one] = open_episodes(tmp_path / "episode_1.hdf5", **SMALL)
     check(one, old[1], len(old[1]))
+
+
+def as_files(images, kind):
+    """Encodes each image; PNG for exact colours, JPEG as ALOHA does."""
+    streams = [io.BytesIO() for _ in images]
+    for image, stream in zip(images, streams, strict=True):
+        Image.fromarray(image).save(stream, kind, quality=95)
+    return [np.frombuffer(stream.getvalue(), np.uint8) for stream in streams]
+
+
+@pytest.mark.parametrize("padded", [True, False], ids=["ALOHA", "RoboMIND"])
+def test_compressed_images_of_aloha_are_decoded(tmp_path, padded):
+    old = [chain(5 + i, i, action_dim=14) for i in range(2)]
+    for i, t in enumerate(old):
+        red = t.image[:-1] * np.array([1, 0, 0], np.uint8)
+        files = as_files(t.image[:-1], "PNG"), as_files(red, "JPEG")
+        longest = max(len(file) for file in (*files[0], *files[1]))
+        with h5py.File(tmp_path / f"episode_{i}.hdf5", "w") as file:
+            file.attrs["compress"] = True
+            file["action"] = t.action
+            file["compress_len"] = np.array([[len(file) for file in part] for part in files])
+            for camera, part in zip(("cam_high", "cam_low"), files, strict=True):
+                name = f"observations/images/{camera}"
+                if padded:
+                    file[name] = np.stack([np.pad(f, (0, longest - len(f))) for f in part])
+                    continue
+                file.create_dataset(name, (len(part),), dtype=h5py.vlen_dtype(np.uint8))
+                for k, one in enumerate(part):
+                    file[name][k] = one
+    with pytest.raises(ValueError, match="images in: observations/images/cam_high, observ"):
+        open_episodes(tmp_path, **SMALL)
+    new = open_episodes(tmp_path, image_key="cam_high", **SMALL)
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected, len(expected))
+    jpeg = open_episodes(tmp_path, image_key="cam_low", **SMALL)[0].image.astype(int)
+    assert np.abs(jpeg[..., 0] - old[0].image[:-1, ..., 0]).max() < 8
+    assert jpeg[..., 2].max() < 8  # red stays red
+
+
+def test_a_damaged_file_of_an_image_is_named(tmp_path):
+    old = chain(5)
+    files = as_files(old.image[:-1], "PNG")
+    images = np.stack([np.pad(file, (0, 200 - len(file))) for file in files])
+    images[3] = 0
+    path = save(tmp_path / "a.hdf5", {"action": old.action, "observations/images/top": images})
+    with pytest.raises(ValueError, match=r"a\.hdf5: image 3 is damaged: cannot identify"):
+        open_episodes(path, **SMALL)[0]
 
 
 def test_groups_with_an_observation_more_than_actions_keep_every_action(tmp_path):

@@ -1,14 +1,16 @@
 """The base of all readers of other data formats: options, and conversion of images and actions."""
 
+import io
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from wpt_agents.data.images import Resizer
+from wpt_agents.data.importers.keys import as_bytes, is_encoded
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
 from wpt_agents.data.units import both_limits, rescaled
 
@@ -180,11 +182,14 @@ def as_actions(action: np.ndarray) -> np.ndarray:
 def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
     """Return resized colour images; of stacked frames, only the newest.
 
-    :param image: (N, H, W, 3 k) or (N, 3 k, H, W) uint8, or whole numbers 0 .. 255 as floats
+    :param image: (N, H, W, 3 k) or (N, 3 k, H, W) uint8, or whole numbers 0 .. 255 as floats; or N
+        PNG or JPEG files, as in `is_encoded`
     :return: (N, S, S, 3) uint8
     :raises ValueError: if it is anything else; names shape, dtype or range, and the remedy
     """
     image = np.asarray(image)
+    if is_encoded(image):
+        return decoded((as_bytes(row) for row in image), resize)
     if image.ndim == 3 and image.dtype == np.uint8:
         raise ValueError(
             f"the images are {image.shape} without a channel axis: grayscale? Repeat them, "
@@ -201,6 +206,23 @@ def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
         image = image.transpose(0, 2, 3, 1)
     _check_channels(image)
     return resize(_as_bytes(image)[..., -3:])
+
+
+def decoded(pictures: Iterable[bytes], resize: Resizer) -> np.ndarray:
+    """Return PNG or JPEG files as images, each resized as soon as it is decoded.
+
+    :return: (N, S, S, 3) uint8
+    :raises ValueError: if one cannot be decoded
+    """
+    reader = needs("PIL.Image", "encoded images")
+    images = []
+    for data in pictures:
+        try:
+            picture = np.array(reader.open(io.BytesIO(data)).convert("RGB"))
+        except (OSError, SyntaxError) as error:
+            raise ValueError(f"image {len(images)} is damaged: {error}") from error
+        images.append(resize(picture[None]))
+    return np.concatenate(images)
 
 
 def _check_channels(image: np.ndarray) -> None:

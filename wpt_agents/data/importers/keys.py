@@ -18,6 +18,7 @@ ENDS = (*TERMINAL, *TIMEOUT, *EITHER, "step_type", "episode_ends")
 # The camera names of known programs. The user names any others.
 CAMERAS = re.compile(r"(observations/images/.*|obs/.*_(image|rgb)|(img|camera_?\d+(_rgb)?))")
 MAIN_CAMERAS = ("agentview_image", "agentview_rgb")  # robomimic's and LIBERO's view of the scene
+ENCODED = (b"\xff\xd8", b"\x89PNG")  # the first bytes of JPEG and PNG files
 
 Table = Mapping[str, Any]  # arrays by name: of NumPy, h5py or zarr
 
@@ -60,8 +61,21 @@ def count(array: Any) -> int:
 
 
 def is_images(array: Any) -> bool:
-    """Return whether the shape is that of images: (N, H, W, C), (N, C, H, W), or grayscale."""
-    return len(array.shape) == 4 or (len(array.shape) == 3 and array.dtype == np.uint8)
+    """Return whether an array holds images: (N, H, W, C), (N, C, H, W), grayscale, or encoded."""
+    dims = len(array.shape)
+    return dims == 4 or (dims == 3 and array.dtype == np.uint8) or is_encoded(array)
+
+
+def is_encoded(array: Any) -> bool:
+    """Return whether each row is a PNG or JPEG file: bytes, or (N, L) uint8 padded with zeros."""
+    dims = len(array.shape)
+    by_row = (dims == 2 and array.dtype == np.uint8) or (dims == 1 and array.dtype.kind in "OSV")
+    return by_row and count(array) > 0 and as_bytes(array[:1][0]).startswith(ENCODED)
+
+
+def as_bytes(row: Any) -> bytes:
+    """Return an encoded image as bytes; anything else becomes no bytes."""
+    return bytes(row) if isinstance(row, bytes | np.void | np.ndarray) else b""
 
 
 def find_keys(

@@ -4,7 +4,6 @@ Step t holds observation t and the action taken at it, and the resulting reward.
 action of the last step (`is_last`) is meaningless, so T + 1 steps are T actions and T + 1 images.
 """
 
-import io
 import os
 import re
 import warnings
@@ -13,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from wpt_agents.data.importers.episodes import Episodes, as_images, needs, warn_left_out
+from wpt_agents.data.importers.episodes import Episodes, decoded, warn_left_out
+from wpt_agents.data.importers.keys import ENCODED
 from wpt_agents.data.importers.records import find_records, read_steps
 from wpt_agents.data.trajectory import Trajectory
 
-JPEG = b"\xff\xd8"  # the first bytes of every JPEG file
 # The parts of a dictionary of actions, in the order in which Open X-Embodiment's users concatenate
 # them: translation, rotation and gripper. Flags that end an episode and motions of a wheeled base
 # are not included.
@@ -112,18 +111,13 @@ class RldsEpisodes(Episodes):
     def _images(self, steps: dict[str, Any], source: str) -> np.ndarray:
         """Return the episode's images, each resized as soon as it is decoded."""
         encoded = self._encoded(steps, source)
-        if encoded[0].startswith(JPEG) and not self._warned:
+        if encoded[0].startswith(ENCODED[0]) and not self._warned:
             self._warned = True
             warnings.warn(f"The images of {self._folder} are JPEG, which is lossy", stacklevel=4)
-        reader = needs("PIL.Image", "images in RLDS datasets")
-        images = []
-        for data in encoded:
-            try:
-                picture = np.array(reader.open(io.BytesIO(data)).convert("RGB"))
-            except (OSError, SyntaxError) as error:
-                raise ValueError(f"{source} has a damaged image: {error}") from error
-            images.append(as_images(picture[None], self._resize))
-        return np.concatenate(images)
+        try:
+            return decoded(encoded, self._resize)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
 
     def _encoded(self, steps: dict[str, Any], source: str) -> list[bytes]:
         """Return the encoded images.
@@ -148,7 +142,7 @@ class RldsEpisodes(Episodes):
 
 
 def _is_picture(data: bytes) -> bool:
-    return data.startswith((JPEG, b"\x89PNG"))
+    return data.startswith(ENCODED)
 
 
 def _instruction(steps: dict[str, Any]) -> str | None:

@@ -135,8 +135,8 @@ def test_mix_refuses_a_share_above_one():
 
 def test_a_saved_buffer_comes_back_whole(tmp_path):
     replay = filled(
-        chain(5, terminated=True, embodiment="walker", task="run", source="ours"),
-        chain(3, reward=None, action_dim=4),
+        chain(5, terminated=True, embodiment="walker", task="run", bounds=[[0, -2], [1, 2]]),
+        chain(3, reward=None, action_dim=4, source="ours"),
     )
     replay.save(tmp_path / "some where.any")
     back = ReplayBuffer.load(tmp_path / "some where.any")

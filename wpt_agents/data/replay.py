@@ -17,7 +17,7 @@ from wpt_agents.files.archive import load_arrays, save_arrays
 
 NEWEST = 5  # episodes that `draw_recent` draws from
 # what an episode's file holds as arrays; the labels below are in its JSON
-ARRAYS = ("image", "action", "reward")
+ARRAYS = ("image", "action", "reward", "bounds")
 LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 
 

@@ -222,6 +222,21 @@ def test_an_empty_demo_of_robomimic_is_left_out(tmp_path):
     check(new, chain(5, 0))
 
 
+def test_links_in_hdf5_are_followed_and_a_broken_one_is_named(tmp_path):
+    old = [chain(5, 0), chain(7, 1)]
+    save_robomimic(tmp_path / "b.hdf5", old)
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["data/demo_0"] = h5py.ExternalLink("b.hdf5", "/data/demo_1")
+        file["data/demo_1"] = h5py.SoftLink("/data/demo_0")
+        file["data/all"] = h5py.SoftLink("/")
+    new = list(open_episodes(tmp_path / "a.hdf5", **SMALL))
+    for episode, expected in zip(new, [old[1], old[1]], strict=True):
+        check(episode, expected)
+    (tmp_path / "b.hdf5").unlink()
+    with pytest.raises(ValueError, match=r"a\.hdf5: the link 'demo_0' in '/data' leads nowhere"):
+        open_episodes(tmp_path / "a.hdf5", **SMALL)
+
+
 def test_the_flag_of_a_terminal_state_in_groups_is_named_by_done_key(tmp_path):
     save_robomimic(tmp_path / "a.hdf5", [chain(5)])
     for key, over in ((None, False), ("dones", True), ("data/demo_0/dones", True)):

@@ -8,7 +8,7 @@
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +43,7 @@ class Hdf5Episodes(TableEpisodes):
             self._handle = h5py.File(file, "r")
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
-        arrays: dict[str, Any] = {}
-
-        def add(name: str, node: Any) -> None:
-            if isinstance(node, h5py.Dataset):
-                arrays[name] = node
-
-        self._handle.visititems(add)
-        return arrays
+        return dict(_arrays(self._handle, h5py.Dataset))
 
     def _task(self, file: Path) -> str | None:
         """Return LIBERO's instruction, or the name of robomimic's environment."""
@@ -62,3 +55,24 @@ class Hdf5Episodes(TableEpisodes):
                 continue
             return "".join(label) if isinstance(label, list) else str(label)
         return None
+
+
+def _arrays(group: Any, kind: type, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the path and array of all arrays in a group, through links, too.
+
+    :param above: the groups that contain it, to which a link may lead back
+    :raises ValueError: if a link leads nowhere
+    """
+    for name in group:
+        try:
+            node = group[name]
+        except (KeyError, OSError) as error:
+            raise ValueError(
+                f"the link {name!r} in {group.name!r} leads nowhere ({error}): restore the file "
+                f"that it names, or remove the link, del file[{group.name!r}][{name!r}]"
+            ) from error
+        if isinstance(node, kind):
+            yield name, node
+        elif hasattr(node, "items") and node not in (*above, group):
+            for inner, array in _arrays(node, kind, (*above, group)):
+                yield f"{name}/{inner}", array

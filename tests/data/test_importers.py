@@ -3,6 +3,7 @@
 import io
 import json
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -338,6 +339,14 @@ def test_a_format_or_option_that_is_mistyped_is_answered_with_the_nearest(tmp_pa
         TrajectoryDataset.from_npz(tmp_path, tmp_path / "out", image_kye="pixels")
 
 
+def test_other_metadata_than_minaris_do_not_make_a_folder_minaris(tmp_path):
+    save_npz(tmp_path / "0.npz", chain(5))
+    (tmp_path / "metadata.json").write_text('{"robot": "arm"}')
+    assert recognise(tmp_path) == "npz"
+    with pytest.raises(ValueError, match=r"is damaged .*: download or record this Minari"):
+        open_episodes(tmp_path, "minari")
+
+
 # Straight from the files
 
 
@@ -357,6 +366,39 @@ def test_a_folder_of_npz_is_converted_once_and_anew_when_a_file_changes(tmp_path
     save_npz(tmp_path / "in/1.npz", chain(6, 1, size=64))
     assert TrajectoryDataset.of(tmp_path / "in").lengths.tolist() == [5, 6]
     assert len(list(cache.iterdir())) == 2
+
+
+def test_a_folder_whose_name_is_a_label_is_converted_again_once_renamed(tmp_path, cache):
+    save_npz(tmp_path / "metaworld/reach/20240101T000000-ab-0-5.npz", chain(5, 0, size=64))
+    assert TrajectoryDataset.of(tmp_path / "metaworld").tasks == ["reach"]
+    (tmp_path / "metaworld/reach").rename(tmp_path / "metaworld/push")
+    assert TrajectoryDataset.of(tmp_path / "metaworld").tasks == ["push"]
+
+
+def test_conversions_of_readers_that_read_otherwise_are_not_used(tmp_path, cache, monkeypatch):
+    save_npz(tmp_path / "in/0.npz", chain(5, 0, size=64))
+    before = cache_folder(tmp_path / "in")
+    monkeypatch.setattr("wpt_agents.data.convert.READERS", 1)
+    assert cache_folder(tmp_path / "in") != before
+
+
+def test_an_episode_that_cannot_be_converted_is_left_out_as_the_error_says(tmp_path):
+    for i in range(4):
+        save_npz(tmp_path / f"in/{i}.npz", chain(5 + i, i))
+    broken = chain(6, 1)
+    broken.action[2, 1] = np.nan
+    save_npz(tmp_path / "in/1.npz", broken)
+    convert = partial(TrajectoryDataset.from_npz, tmp_path / "in", **SMALL)
+    remedy = r"action 2 is nan .*leave that episode out.* skip=\[1\] \(--skip=1\) leaves this one"
+    with pytest.raises(ValueError, match=remedy):
+        convert(tmp_path / "out")
+    assert convert(tmp_path / "out", skip=[1]).lengths.tolist() == [5, 7, 8]
+    save_npz(tmp_path / "in/3.npz", broken)
+    with pytest.raises(ValueError, match=r"skip=\[3\]"):  # the number in the source
+        convert(tmp_path / "two", skip=[1])
+    assert convert(tmp_path / "two", skip=[1, 3]).lengths.tolist() == [5, 7]
+    with pytest.raises(ValueError, match="skip names the episode 4, but there are 4, counted fro"):
+        convert(tmp_path / "three", skip=[4])
 
 
 def test_pretraining_takes_whatever_can_be_read(tmp_path, cache, monkeypatch):
@@ -695,6 +737,24 @@ def test_a_lerobot_video_that_is_too_short_is_named(tmp_path):
     assert len(episodes[0]) == 5
     with pytest.raises(ValueError, match=r"episode 1: .*mp4 has no frame at 1\.000 s"):
         episodes[1]
+
+
+def test_a_lerobot_dataset_of_some_episodes_is_read_with_these_alone(tmp_path):
+    save_lerobot(tmp_path, [6, 9, 1, 5], video=False)
+    made = {"__module__": "lerobot.datasets.lerobot_dataset"}
+    loaded = type("LeRobotDataset", (), made | {"root": tmp_path, "episodes": [1, 3]})()
+    with pytest.warns(UserWarning, match="Images of 32 x 32 are resized"):
+        assert TrajectoryDataset.of(loaded).lengths.tolist() == [8, 4]
+    with pytest.raises(ValueError, match="has no episode 7"):
+        open_episodes(tmp_path, episodes=[1, 7])
+
+
+def test_an_unknown_robot_of_lerobot_has_no_name(tmp_path):
+    save_lerobot(tmp_path, [6], video=False)
+    path = tmp_path / "meta/info.json"
+    path.write_text(path.read_text().replace("so100", "unknown"))
+    with pytest.warns(UserWarning, match="Images of 32 x 32 are resized"):
+        assert open_episodes(tmp_path, **SMALL)[0].embodiment is None
 
 
 def test_an_older_lerobot_version_and_a_camera_that_is_not_there_are_named(tmp_path):

@@ -3,13 +3,15 @@
 import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import pytest
 from chain import chain, follows
+from test_importers import save_npz
 
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.data.importers.formats import open_episodes
+from wpt_agents.data.importers.formats import open_episodes, recognise
 from wpt_agents.data.importers.official import OfficialEpisodes, is_official
 
 
@@ -58,6 +60,16 @@ def test_both_suites_and_single_folders_are_recognised_too(published, monkeypatc
     )
     monkeypatch.chdir(published / "dmcontrol")
     assert labels(open_episodes("walker", image_size=8)) == [("walker", None)] * 2
+
+
+def test_own_episodes_below_a_folder_of_such_a_name_are_not_the_authors(tmp_path):
+    for i in range(2):
+        save_npz(tmp_path / "metaworld" / "mine" / f"{i}.npz", chain(5, i))
+    assert recognise(tmp_path / "metaworld") == "npz"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for form in ("npz", "official"):  # 0.npz is not an episode of length 0
+            assert len(open_episodes(tmp_path / "metaworld", form)) == 2
 
 
 def test_a_label_that_is_asked_for_comes_before_the_folders(published):

@@ -24,6 +24,7 @@ from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import Source, TrajectoryDataset
 from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.formats import FORMATS, NAMES, open_episodes, recognise
+from wpt_agents.data.importers.lerobot import LeRobotEpisodes
 from wpt_agents.data.importers.minari import MinariEpisodes, local_minari
 from wpt_agents.data.importers.recognise import refusal
 from wpt_agents.data.importers.sb3 import SB3Episodes
@@ -32,6 +33,10 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.data.units import Ranges
 from wpt_agents.files.locks import locked
+
+# Increased when a reader begins to read a format differently, so that conversions by earlier
+# versions are not used any more.
+READERS = 2
 
 One = Source | TrajectoryDataset | SB3Buffer | ReplayBuffer | Episodes | Trajectory
 Data = One | Sequence[One] | Iterable[Trajectory]
@@ -62,7 +67,10 @@ def open_dataset(data: Data) -> TrajectoryDataset:
     if module == "minari":
         return _stored(MinariEpisodes(data))
     if module == "lerobot" and hasattr(data, "root"):
-        return _open_path(data.root)
+        chosen = getattr(data, "episodes", None)
+        if chosen is None:
+            return _open_path(data.root)
+        return _stored(LeRobotEpisodes(data.root, episodes=chosen))
     if isinstance(data, Episodes) or not isinstance(data, Sequence):
         return _stored(_checked(data))
     if not data:
@@ -156,12 +164,25 @@ def from_episodes(
     ranges = Ranges()
     with dataset, bar:
         for i in range(done, len(episodes)):
-            trajectory = episodes[i]
+            trajectory = _converted(episodes, i)
             dataset.append(trajectory)
             ranges.add(trajectory)
             bar.update()
     ranges.warn(episodes.name)
     return dataset
+
+
+def _converted(episodes: Episodes, i: int) -> Trajectory:
+    try:
+        return episodes[i]
+    except ValueError as error:
+        if i == 0:  # what is wrong with the first one may be wrong with all
+            raise
+        number = episodes.number(i)
+        raise ValueError(
+            f"{error}. The episodes before it are converted; skip=[{number}] (--skip={number}) "
+            "leaves this one out"
+        ) from error
 
 
 def _same(dataset: TrajectoryDataset, read: Trajectory) -> bool:
@@ -187,11 +208,12 @@ def cache_folder(source: Source) -> Path:
     """
     path = Path(source).resolve() if Path(source).exists() else local_minari(os.fspath(source))
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    digest = hashlib.sha256(os.fsencode(path))
+    digest = hashlib.sha256(os.fsencode(path) + b" %d" % READERS)
     for file in files:
         # Size and time instead of the content, which may be many gigabytes.
         stat = file.stat()
-        digest.update(f"{file.name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+        name = file.relative_to(path).as_posix()  # the folders in it may be labels
+        digest.update(os.fsencode(f"{name} {stat.st_size} {stat.st_mtime_ns}\n"))
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "wpt_agents" / f"{path.name}-{digest.hexdigest()[:16]}"
 

@@ -76,6 +76,10 @@ class Episodes(ABC):
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[i] for i in range(len(self)))
 
+    def number(self, i: int) -> int:
+        """The number by which `skip` leaves episode `i` out."""
+        return i
+
     def _trajectory(
         self,
         image: np.ndarray,
@@ -132,6 +136,37 @@ class Episodes(ABC):
     def _refuse_done_key(self, form: str) -> None:
         if self.done_key is not None:
             raise ValueError(f"{form} stores where episodes end; leave done_key out")
+
+
+class Without(Episodes):
+    """The episodes of a source without some of them.
+
+    :param skip: the numbers of those, counted from 0
+    :raises ValueError: if there is no episode of such a number
+    """
+
+    def __init__(self, episodes: Episodes, skip: Iterable[int]) -> None:
+        super().__init__(episodes.image_size)
+        self.name = episodes.name
+        self._episodes = episodes
+        gone = {int(i) for i in skip}
+        strange = sorted(gone - set(range(len(episodes))))
+        if strange:
+            raise ValueError(
+                f"skip names the episode {strange[0]}, but there are {len(episodes)}, counted from "
+                "0"
+            )
+        self._kept = [i for i in range(len(episodes)) if i not in gone]
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        return self._episodes[self._kept[i]]
+
+    def number(self, i: int) -> int:
+        """The number of episode `i` in the source."""
+        return self._kept[i]
 
 
 def as_keys(names: str | Sequence[str] | None) -> tuple[str, ...]:

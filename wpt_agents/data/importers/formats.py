@@ -2,11 +2,12 @@
 
 import inspect
 import os
+from collections.abc import Sequence
 from typing import Any
 
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from wpt_agents.data.importers.episodes import Episodes
+from wpt_agents.data.importers.episodes import Episodes, Without
 from wpt_agents.data.importers.hdf5 import Hdf5Episodes
 from wpt_agents.data.importers.lerobot import LeRobotEpisodes
 from wpt_agents.data.importers.minari import MinariEpisodes
@@ -35,10 +36,14 @@ Source = str | os.PathLike[str]
 
 
 def open_episodes(
-    source: Source | ReplayBuffer, form: str | None = None, **options: Any
+    source: Source | ReplayBuffer,
+    form: str | None = None,
+    skip: Sequence[int] = (),
+    **options: Any,
 ) -> Episodes:
     """Open the episodes at `source`, in the format `form` or in the one that is recognised.
 
+    :param skip: the numbers of episodes to leave out, counted from 0
     :param options: the reader's own keywords, and those of `Episodes`
     :raises ValueError: if the format, an option or the source is unknown
     """
@@ -51,14 +56,15 @@ def open_episodes(
         raise unknown_name("format", form, FORMATS)
     parameters = inspect.signature(FORMATS[form].__init__).parameters
     shared = inspect.signature(Episodes.__init__).parameters
-    valid = [name for name in [*list(parameters)[2:], *shared] if name not in ("self", "options")]
+    names = [*list(parameters)[2:], *shared, "skip"]
+    valid = [name for name in names if name not in ("self", "options")]
     for name in options:
         if name not in valid:
             raise unknown_name(f"option for {form}", name, valid)
     episodes = FORMATS[form](source, **options)  # type: ignore[arg-type]
     if isinstance(source, str):
         episodes.name = source
-    return episodes
+    return Without(episodes, skip) if len(skip) else episodes
 
 
 def recognise(source: Source | ReplayBuffer) -> str | None:

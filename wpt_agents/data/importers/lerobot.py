@@ -8,7 +8,7 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,17 @@ class LeRobotEpisodes(Episodes):
     :param folder: with `meta/info.json`
     :param camera: the camera, if there are several; the same as `image_key`. The last part of its
         name is enough
+    :param episodes: only the episodes of these indices, as in LeRobotDataset
     :param options: those of `Episodes`; `low` and `high` replace the minimum and maximum
         actions in the statistics
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], camera: str | None = None, **options: Any
+        self,
+        folder: str | os.PathLike[str],
+        camera: str | None = None,
+        episodes: Sequence[int] | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(**options)
         self._refuse_done_key("LeRobot")
@@ -39,11 +44,14 @@ class LeRobotEpisodes(Episodes):
         version = str(self._info.get("codebase_version"))
         # version 2 has a file for each episode, and other metadata
         if not version.startswith("v3."):
-            raise ValueError(f"{folder} is of version {version}; convert it to v3.0 with lerobot")
+            raise ValueError(
+                f"{folder} is of version {version}; convert it to v3.0 with lerobot: "
+                "`python -m lerobot.scripts.convert_dataset_v21_to_v30` takes v2.1"
+            )
         self._camera = self._choose(camera or self.image_key)
         self._actions = self._choose_actions()
         self._own_limits = None if self.limits is not None else self._read_limits()
-        self._rows = self._episodes()
+        self._rows = self._episodes(episodes)
         self._open: tuple[Path, Any] | None = None
         if self._is_video:
             warnings.warn(
@@ -94,7 +102,7 @@ class LeRobotEpisodes(Episodes):
         high = np.concatenate([np.ravel(stats[name]["max"]) for name in self._actions])
         return low.astype(np.float64), high.astype(np.float64)
 
-    def _episodes(self) -> list[dict[str, Any]]:
+    def _episodes(self, chosen: Sequence[int] | None) -> list[dict[str, Any]]:
         files = sorted((self._folder / "meta" / "episodes").rglob("*.parquet"))
         prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
         rows = []
@@ -104,6 +112,11 @@ class LeRobotEpisodes(Episodes):
             rows += self._parquet.read_table(file, columns=columns).to_pylist()
         if not rows:
             raise ValueError(f"{self._folder} has no episodes in meta/episodes")
+        if chosen is not None:
+            rows = [row for row in rows if row["episode_index"] in set(chosen)]
+            missing = set(chosen) - {row["episode_index"] for row in rows}
+            if missing:
+                raise ValueError(f"{self._folder} has no episode {min(missing)}")
         long = [row for row in rows if row["length"] > 1]
         warn_left_out(len(rows) - len(long), self._folder)
         return sorted(long, key=lambda row: int(row["episode_index"]))
@@ -130,9 +143,13 @@ class LeRobotEpisodes(Episodes):
             np.ravel(table["next.reward"].to_pylist())[:-1] if rewarded else None,
             source,
             self._own_limits,
-            embodiment=self.embodiment or self._info.get("robot_type"),
+            embodiment=self.embodiment or self._robot(),
             task=self.task or tasks[0],
         )
+
+    def _robot(self) -> str | None:
+        robot = self._info.get("robot_type")
+        return None if robot == "unknown" else robot  # not the name of one robot
 
     def _table(self, row: dict[str, Any]) -> Any:
         """Return the episode's rows in order; the file is cached for the next episode."""

@@ -101,7 +101,7 @@ def _named(what: str) -> Iterator[None]:
     """Add the name of the damaged part, which the errors of HDF5 and Arrow lack."""
     try:
         yield
-    except (OSError, KeyError, RuntimeError) as error:
+    except (OSError, KeyError, RuntimeError, AssertionError) as error:
         raise ValueError(
             f"{what} is damaged ({error}): download or record this Minari dataset again"
         ) from error

@@ -5,6 +5,7 @@ folders are the labels: DMControl's are robots, Meta-World's are tasks of one ro
 """
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from wpt_agents.data.importers.npz import NpzEpisodes
 
 DMC, METAWORLD = SUITES = ("dmcontrol", "metaworld")
+NAME = re.compile(r"[^-]+-[^-]+-\d+-(\d+)\.npz")  # time, id, number and length
 
 
 class OfficialEpisodes(NpzEpisodes):
@@ -33,10 +35,10 @@ class OfficialEpisodes(NpzEpisodes):
         super().__init__(folder, shifted=True, **options)
 
     def _kind(self, file: Path) -> str:
-        length = file.stem.rpartition("-")[2]  # avoids opening tens of thousands of files
-        if not length.isdecimal():
+        named = NAME.fullmatch(file.name)  # avoids opening tens of thousands of files
+        if named is None:
             return super()._kind(file)
-        return "episode" if int(length) > 0 else "single"
+        return "episode" if int(named[1]) > 0 else "single"
 
     def _actions(self, arrays: dict[str, np.ndarray], taken: slice) -> np.ndarray:
         return super()._actions(arrays, taken).clip(-1, 1)
@@ -57,6 +59,11 @@ def is_official(folder: str | os.PathLike[str]) -> bool:
     path = Path(folder)
     inside = any((path / suite).is_dir() for suite in SUITES)
     return inside or bool(_below_suite(path))
+
+
+def holds_official(folder: Path) -> bool:
+    """Return whether such a folder holds files that are named as the authors'."""
+    return is_official(folder) and any(NAME.fullmatch(f.name) for f in folder.rglob("*.npz"))
 
 
 def _below_suite(folder: Path) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from wpt_agents.data.importers.keys import natural
 from wpt_agents.data.importers.minari import local_minari
 from wpt_agents.data.importers.npz import is_flat
-from wpt_agents.data.importers.official import is_official
+from wpt_agents.data.importers.official import holds_official
 
 IN_FOLDERS = (("*.tfrecord*", "rlds"), ("*.hdf5", "hdf5"), ("*.h5", "hdf5"), ("*.npz", "npz"))
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
@@ -41,18 +41,26 @@ def _file_format(path: Path) -> str | None:
 def _folder_format(path: Path) -> str | None:
     if (path / "meta" / "info.json").exists():
         return "lerobot"
-    if any((path / part / "metadata.json").exists() for part in ("data", ".")):
+    if any(_is_minari(path / part) for part in ("data", ".")):
         return "minari"
     if path.suffix == ".zarr" or any((path / n).exists() for n in (".zgroup", "zarr.json")):
         return "zarr"
     if _model_in(path):
         return None
-    if is_official(path) and next(path.rglob("*.npz"), None):
+    if holds_official(path):
         return "official"
     for pattern, form in IN_FOLDERS:
         if next(path.rglob(pattern), None):
             return form
     return None
+
+
+def _is_minari(folder: Path) -> bool:
+    """Return whether a folder has the metadata of Minari, and not those of another program."""
+    try:
+        return '"data_format"' in (folder / "metadata.json").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def _model_in(folder: Path) -> Path | None:

@@ -58,6 +58,10 @@ Camera = Annotated[
 Split = Annotated[
     str | None, typer.Option(help="For rlds: read only this split, for example train.")
 ]
+Skip = Annotated[
+    str | None,
+    typer.Option(help="The numbers of episodes to leave out, counted from 0: `--skip=3,17`."),
+]
 Low = Annotated[
     str | None,
     typer.Option(
@@ -89,6 +93,7 @@ def import_data(
     shifted: Shifted = None,
     camera: Camera = None,
     split: Split = None,
+    skip: Skip = None,
     low: Low = None,
     high: High = None,
     trust: Trust = False,
@@ -108,6 +113,7 @@ def import_data(
         "shifted": shifted,
         "camera": camera,
         "split": split,
+        "skip": _integers("--skip", skip),
         "low": _numbers("--low", low),
         "high": _numbers("--high", high),
         "trust": trust or None,
@@ -129,6 +135,13 @@ def _numbers(option: str, text: str | None) -> list[float] | None:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise ValueError(f"{option} takes numbers separated by commas, got {text!r}") from None
+
+
+def _integers(option: str, text: str | None) -> list[int] | None:
+    numbers = _numbers(option, text)
+    if numbers is not None and any(number != int(number) for number in numbers):
+        raise ValueError(f"{option} takes whole numbers separated by commas, got {text!r}")
+    return None if numbers is None else [int(number) for number in numbers]
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -122,7 +122,7 @@ def test_compressed_images_of_aloha_are_decoded(tmp_path, padded):
                 file.create_dataset(name, (len(part),), dtype=h5py.vlen_dtype(np.uint8))
                 for k, one in enumerate(part):
                     file[name][k] = one
-    with pytest.raises(ValueError, match="images in: observations/images/cam_high, observ"):
+    with pytest.raises(ValueError, match="images in: observations/images/cam_high, "):
         open_episodes(tmp_path, **SMALL)
     new = open_episodes(tmp_path, image_key="cam_high", **SMALL)
     for episode, expected in zip(new, old, strict=True):

@@ -250,7 +250,7 @@ def decoded(pictures: Iterable[bytes], resize: Resizer) -> np.ndarray:
     :raises ValueError: if one cannot be decoded
     """
     reader = needs("PIL.Image", "encoded images")
-    images = []
+    images: list[np.ndarray] = []
     for data in pictures:
         try:
             picture = np.array(reader.open(io.BytesIO(data)).convert("RGB"))

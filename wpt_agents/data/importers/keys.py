@@ -75,7 +75,9 @@ def is_encoded(array: Any) -> bool:
 
 def as_bytes(row: Any) -> bytes:
     """Return an encoded image as bytes; anything else becomes no bytes."""
-    return bytes(row) if isinstance(row, bytes | np.void | np.ndarray) else b""
+    if isinstance(row, np.ndarray | np.void):
+        return row.tobytes()
+    return row if isinstance(row, bytes) else b""
 
 
 def find_keys(

@@ -106,6 +106,10 @@ def import_data(
     from wpt_agents.data.importers.formats import open_episodes
 
     choices: dict[str, Any] = {
+        "embodiment": embodiment,
+        "task": task,
+        "rewards": rewards,
+        "image_size": image_size,
         "image_key": image_key,
         "action_key": action_key,
         "done_key": done_key,
@@ -119,11 +123,10 @@ def import_data(
         "trust": trust or None,
     }
     options = {name: value for name, value in choices.items() if value is not None}
-    shared = {"embodiment": embodiment, "task": task, "rewards": rewards, "image_size": image_size}
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
         warnings.showwarning = _show_warning
-        episodes = open_episodes(source, None if form == "auto" else form, **shared, **options)
+        episodes = open_episodes(source, None if form == "auto" else form, **options)
         dataset = TrajectoryDataset.from_episodes(episodes, out, progress_bar=True)
     print_summary(dataset)
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 from chain import chain, check_chain
 
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
@@ -19,6 +20,29 @@ def test_led_to_by_hand():
     assert streams["reward"].tolist() == [0, 1, 2, 3]
     assert streams["is_first"].tolist() == [True, False, False, False]
     assert streams["is_terminal"].tolist() == [False, False, False, True]
+
+
+def test_lists_and_tensors_are_taken_as_arrays():
+    old = chain(3)
+    new = Trajectory(torch.from_numpy(old.image), old.action.tolist(), old.reward.tolist())
+    np.testing.assert_array_equal(new.image, old.image)
+    np.testing.assert_array_equal(new.action, old.action)
+    assert isinstance(new.image, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda image: image.transpose(0, 3, 1, 2), lambda image: image / np.float32(255)],
+    ids=["channels first", "floats"],
+)
+def test_the_remedy_for_images_of_another_form_works(make):
+    old = chain(3)
+    image = make(old.image)
+    with pytest.raises(ValueError, match=r"must be \(T \+ 1, H, W, 3\) uint8, got .*; ") as refused:
+        Trajectory(image, old.action)
+    code = str(refused.value).split("; ")[1].split(" if ")[0]
+    new = Trajectory(eval(code), old.action)
+    np.testing.assert_array_equal(new.image, old.image)
 
 
 def test_a_reward_too_large_for_float32_is_refused():

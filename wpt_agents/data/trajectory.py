@@ -59,19 +59,26 @@ class Trajectory:
     bounds: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        image, action, reward = self.image, self.action, self.reward
+        image, action = np.asarray(self.image), np.asarray(self.action)
+        reward = self.reward
         if reward is not None:
             with np.errstate(over="ignore"):  # to infinity, which is refused below
                 reward = np.asarray(reward).astype(np.float32)
         if image.ndim != 4 or image.shape[-1] != 3 or image.dtype != np.uint8:
+            remedy = "; np.rint(255 * image).astype(np.uint8) if 1 is white"
+            if image.dtype == np.uint8:
+                remedy = "; image.transpose(0, 2, 3, 1)" if image.shape[1:2] == (3,) else ""
             raise ValueError(
                 f"Trajectory.image must be (T + 1, H, W, 3) uint8, got {image.shape} {image.dtype}"
+                f"{remedy}"
             )
         if action.ndim != 2 or len(action) != len(image) - 1 or len(action) == 0:
             raise ValueError(
                 f"Trajectory.action must be (T, A) with T = {len(image) - 1} >= 1 for "
                 f"{len(image)} images, got {action.shape}"
             )
+        if action.dtype.kind not in "fiub":
+            raise ValueError(f"Trajectory.action must be numbers, got {action.dtype}")
         check_range(action)
         if reward is not None and (reward.shape != (len(action),) or not np.isfinite(reward).all()):
             raise ValueError(
@@ -80,6 +87,7 @@ class Trajectory:
             )
         if not 0 <= self.action_dim <= action.shape[1]:
             raise ValueError(f"action_dim {self.action_dim} exceeds the width {action.shape[1]}")
+        object.__setattr__(self, "image", image)
         object.__setattr__(self, "action", np.asarray(action, np.float32))
         object.__setattr__(self, "action_dim", int(self.action_dim) or action.shape[1])
         if self.bounds is not None:

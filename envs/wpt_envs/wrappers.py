@@ -1,5 +1,6 @@
 """Small wrappers, each named by a verb: CheckAction, RepeatAction, PadAction, SeePixels."""
 
+from copy import copy
 from typing import Any
 
 import gymnasium as gym
@@ -78,7 +79,8 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
         """Take one step of the agent; return the last observation, the rewards' sum and info."""
         total = 0.0
         for _ in range(self._times):
-            obs, reward, terminated, truncated, info = self.env.step(action)
+            # a copy, since some environments scale the action in place
+            obs, reward, terminated, truncated, info = self.env.step(copy(action))
             total += float(reward)
             if terminated or truncated:
                 break

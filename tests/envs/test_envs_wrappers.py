@@ -81,6 +81,23 @@ def test_repeating_sums_rewards_and_stops_at_the_end():
     assert env.metadata["render_fps"] == 15
 
 
+class Scaling(Count):
+    """Scales its action in place, as many environments do."""
+
+    def step(self, action):
+        action *= 0.5
+        return super().step(action.copy())
+
+
+def test_every_repeat_gets_the_agents_action():
+    env = RepeatAction(Scaling(), times=2)
+    env.reset()
+    action = np.ones(2)
+    env.step(action)
+    assert [a.tolist() for a in env.unwrapped.actions] == [[0.5, 0.5]] * 2
+    assert action.tolist() == [1, 1]
+
+
 @pytest.mark.parametrize("times", [0, -2, 1.5])
 def test_repeating_less_than_once_or_in_part_is_refused(times):
     with pytest.raises(ValueError, match="whole number, 1 or more"):

@@ -105,6 +105,29 @@ def test_the_stored_actions_lead_to_the_stored_images(tmp_path):
     assert np.array_equal(replayed.image, stored.image)
 
 
+class Careless(gym.Wrapper):
+    """Draws every image into the same array, and scales actions in place."""
+
+    def reset(self, **kwargs):
+        image, info = self.env.reset(**kwargs)
+        self.image = image.copy()
+        return self.image, info
+
+    def step(self, action):
+        self.image[:], *outcome = self.env.step(action)
+        action *= 0.5
+        return self.image, *outcome
+
+
+def test_a_recording_keeps_what_an_environment_overwrites():
+    def act(obs, info, t):
+        return np.array([0.5, -0.5], np.float32)
+
+    careless, careful = (record(env, act, 0) for env in (Careless(gym.make(DOT)), gym.make(DOT)))
+    assert np.array_equal(careless.image, careful.image)
+    assert np.array_equal(careless.action, careful.action)
+
+
 def test_half_a_dataset_is_continued_to_the_same_data(tmp_path, monkeypatch):
     whole = collect(tmp_path / "whole", [DOT, WIDE], 6, workers=1, progress_bar=False)
     jobs, play = [], module.play

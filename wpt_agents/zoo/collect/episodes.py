@@ -29,12 +29,13 @@ MAX_STEPS = 1000  # limit for environments without a time limit
 def record(env: gym.Env, act: Act, seed: int, max_steps: int = MAX_STEPS) -> Trajectory:
     """Play one episode of at most `max_steps`, and return it with its rewards."""
     obs, info = env.reset(seed=seed)
-    images, actions, rewards = [obs], list[np.ndarray](), list[float]()
+    # copies, since some environments draw into the same array or scale the action in place
+    images, actions, rewards = [np.array(obs)], list[np.ndarray](), list[float]()
     terminated = truncated = False
     while not (terminated or truncated or len(actions) == max_steps):
         action = np.asarray(act(obs, info, len(actions)), np.float32)
-        obs, reward, terminated, truncated, info = env.step(action)
-        images.append(obs)
+        obs, reward, terminated, truncated, info = env.step(action.copy())
+        images.append(np.array(obs))
         actions.append(action)
         rewards.append(float(reward))
     return Trajectory(

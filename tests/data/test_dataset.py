@@ -1,6 +1,8 @@
+import copy
 import gc
 import json
 import os
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,6 +15,18 @@ from wpt_agents.data import shards
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
+
+
+def test_a_dataset_with_threads_or_a_writer_can_be_copied_and_pickled(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "a", image_size=8, workers=2) as dataset:
+        dataset.append(chain(20))
+        dataset.sample(2, 4)  # starts the threads
+        for other in (copy.deepcopy(dataset), pickle.loads(pickle.dumps(dataset))):
+            assert other.workers == 2
+            check_chain(other.sample(2, 4))
+            with pytest.raises(ValueError, match="written to by another process"):
+                other.append(chain(3))
+        dataset.append(chain(5))
 
 
 def made(path, *trajectories, **kwargs):

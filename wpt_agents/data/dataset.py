@@ -254,6 +254,10 @@ class TrajectoryDataset(StoredTrajectories):
             self._writer = None
         self._threads.close()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles read the same folder; the right to write is not copied."""
+        return {**vars(self), "_writer": None}
+
     def __enter__(self) -> "TrajectoryDataset":
         return self
 

@@ -22,6 +22,10 @@ class Threads:
         self._pool: ThreadPoolExecutor | None = None
         self._owner = 0
 
+    def __reduce__(self) -> tuple[type["Threads"], tuple[int]]:
+        """Copies and pickles start threads of their own."""
+        return type(self), (self.workers,)
+
     def map(self, function: Callable[[In], Out], items: Iterable[In]) -> Iterable[Out]:
         """Apply `function` to each item; results come in the items' order."""
         if self.workers < 1:

@@ -400,6 +400,16 @@ def test_ogbench_rows_are_read_in_any_order(tmp_path):
             check(episodes[i], old[i])
 
 
+def test_rows_in_npz_may_be_transposed_and_beside_objects(tmp_path):
+    old = chain(5)
+    actions = np.asfortranarray(old.action)  # as np.stack([x, y]).T is
+    info = np.array({"robot": "arm"}, object)
+    over = last([old])
+    path = tmp_path / "a.npz"
+    np.savez(path, observations=old.image[:-1], actions=actions, terminals=over, info=info)
+    check(open_episodes(path, **SMALL)[0], old, 5)
+
+
 def test_a_damaged_npz_of_rows_is_named(tmp_path):
     save_ogbench(tmp_path / "a.npz", [chain(50)])
     content = bytearray((tmp_path / "a.npz").read_bytes())
@@ -456,6 +466,14 @@ def test_zarr_rows_end_at_episode_ends(tmp_path, dtype, version):
     for episode, expected in zip(new, old, strict=True):
         check(episode, expected, len(expected))
     assert new[0].bounds.tolist() == [[0, 0], [512, 512]]
+
+
+def test_rows_after_the_last_episode_end_are_left_out(tmp_path):
+    old = [chain(5, 0), chain(7, 1), chain(9, 2)]
+    arrays = rows(old) | {"episode_ends": np.array([5, 12])}
+    with pytest.warns(UserWarning, match="The 9 rows after the last of 'episode_ends' belong to"):
+        new = list(open_episodes(save(tmp_path / "a.hdf5", arrays), **SMALL))
+    assert [len(episode) for episode in new] == [4, 6]
 
 
 def test_a_zarr_group_that_is_damaged_is_named(tmp_path):

@@ -190,7 +190,9 @@ class FlatNpz(TableEpisodes):
         try:
             self._archive = zipfile.ZipFile(file)
             names = [n.removesuffix(".npy") for n in self._archive.namelist()]
-            return {name: Member(self._archive, name) for name in names}
+            members = {name: Member(self._archive, name) for name in names}
+            # Python objects, such as dictionaries about the recording, would need a pickle.
+            return {name: m for name, m in members.items() if not m.dtype.hasobject}
         except FAULTS as error:
             raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error
 
@@ -209,15 +211,20 @@ class Member:
         version = np.lib.format.read_magic(self._stream)  # type: ignore[no-untyped-call]
         read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
         self.shape, fortran, self.dtype = read(self._stream)
-        # objects would need a pickle; rows of Fortran order are not adjacent
-        if self.dtype.hasobject or fortran:
-            raise ValueError(f"{name} is not a plain array in C order")
         self._data = self._stream.tell()
+        # The rows of an array in Fortran order, a transposed one, are not adjacent.
+        self._whole = self._read_whole() if fortran and not self.dtype.hasobject else None
 
     def __len__(self) -> int:
         return int(self.shape[0]) if self.shape else 0
 
+    def _read_whole(self) -> np.ndarray:
+        numbers = np.frombuffer(self._stream.read(), self.dtype)
+        return np.ascontiguousarray(numbers.reshape(self.shape, order="F"))
+
     def __getitem__(self, rows: slice) -> np.ndarray:
+        if self._whole is not None:
+            return self._whole[rows]
         start, stop, _ = rows.indices(len(self))
         size = int(self.dtype.itemsize * np.prod(self.shape[1:], dtype=np.int64))
         try:

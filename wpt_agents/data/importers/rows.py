@@ -7,6 +7,7 @@ last action exists only if there is also an array `next_...` of images, or one i
 actions; without it that action is dropped, and no terminal state is seen.
 """
 
+import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -66,7 +67,16 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
             f"there are: {', '.join(table)}"
         )
     ends = np.concatenate([_ends(np.ravel(table[name][:]), name, rows) for name in names])
-    edges = np.unique(np.concatenate([[0], ends, [rows]]).astype(int)).tolist()
+    # Flags leave an unfinished episode at the end; numbers name all episodes.
+    if any(_is_flag(table[name], name, rows) for name in names):
+        ends = np.append(ends, rows)
+    elif rows > (last := int(ends.max(initial=0))):
+        warnings.warn(
+            f"The {rows - last} rows after the last of {names[0]!r} belong to no episode, and are "
+            "left out",
+            stacklevel=5,
+        )
+    edges = np.unique(np.append(0, ends).astype(int)).tolist()
     doubtful = False
     if shifted is None:
         empty, acts = _beginnings(table, columns, edges[:-1])
@@ -101,7 +111,7 @@ def _flags(table: Table, done_key: str | None) -> list[str]:
 
 def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
     """Return one past the last row of each episode."""
-    if keys.leaf(name) == "episode_ends" or len(flags) != rows:
+    if not _is_flag(flags, name, rows):
         if len(flags) and (np.any(np.diff(flags) <= 0) or flags[-1] > rows):
             raise ValueError(
                 f"{name!r} has {len(flags)} entries for {rows} rows, and they are not the growing "
@@ -109,6 +119,11 @@ def _ends(flags: np.ndarray, name: str, rows: int) -> np.ndarray:
             )
         return flags
     return _flagged(flags, name)
+
+
+def _is_flag(array: Any, name: str, rows: int) -> bool:
+    """Return whether an array has a flag for each row, instead of the numbers of last rows."""
+    return keys.leaf(name) != "episode_ends" and count(array) == rows
 
 
 def _flagged(flags: np.ndarray, name: str) -> np.ndarray:

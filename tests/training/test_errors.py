@@ -105,8 +105,14 @@ def test_a_dataset_of_other_images_is_refused(tmp_path):
     with TrajectoryDataset.create(tmp_path / "data", image_size=84) as dataset:
         dataset.append(other)
     refused(dataset, r"images of 84 pixels, .* copy, TrajectoryDataset\.merge\('NEW', .*size=64\)")
-    with pytest.warns(UserWarning, match="84 x 84 are resized to 64 x 64"):
-        pretrained(TrajectoryDataset.merge(tmp_path / "new", [dataset.path], image_size=64))
+    for number, passed in enumerate((dataset, dataset.subset([0]), [dataset, dataset])):
+        with pytest.raises(ValueError, match="images of 84 pixels") as error:
+            pretrained(passed)
+        remedy = str(error.value).split("copy, ")[1].replace("NEW", f"{tmp_path}/{number}")
+        with pytest.warns(UserWarning, match="84 x 84 are resized to 64 x 64"):
+            small = eval(remedy, {"TrajectoryDataset": TrajectoryDataset, "dataset": passed})
+        assert (len(small), small.image_size) == (1 + (number == 2), 64)
+    pretrained(small)
     with pytest.warns(UserWarning, match="84 x 84 are resized to 64 x 64"):
         pretrained([other])
 

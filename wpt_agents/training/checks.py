@@ -29,8 +29,8 @@ def check_images(dataset: TrajectoryDataset) -> None:
     if dataset.image_size != IMAGE_SIZE:
         raise ValueError(
             f"The dataset {dataset.path} has images of {dataset.image_size} pixels, agents take "
-            f"{IMAGE_SIZE}: make a resized copy, "
-            f"TrajectoryDataset.merge('NEW', ['{dataset.path}'], image_size={IMAGE_SIZE})"
+            f"{IMAGE_SIZE}: make a resized copy, TrajectoryDataset.merge('NEW', "
+            f"[TrajectoryDataset.of(dataset)], image_size={IMAGE_SIZE})"
         )
 
 

@@ -27,21 +27,30 @@ def find_records(file: Path) -> Iterator[tuple[int, int, bool]]:
         return
     with open(file, "rb") as opened:
         data = memoryview(mmap(opened.fileno(), 0, access=ACCESS_READ))
-    if bytes(data[:2]) in (GZIP, ZLIB):
-        kind = "gzip" if bytes(data[:2]) == GZIP else "zlib"
-        raise ValueError(
-            f"{file} is compressed by {kind} as a whole; unpack it first, for example by "
-            f"`gunzip < {file.name} > unpacked/{file.name}`"
-            if kind == "gzip"
-            else f"{file} is compressed by {kind} as a whole; write it without compression"
-        )
     while at < end:
         head = data[at : at + 12]
         size = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else end
         if at + 16 + size > end:
-            raise ValueError(f"{file} is cut short: a record at byte {at} goes past its end")
+            raise _unreadable(file, at, bytes(data[:2]))
         yield at + 12, size, _is_single(data[at + 12 : at + 12 + size])
         at += 16 + size
+
+
+def _unreadable(file: Path, at: int, begin: bytes) -> ValueError:
+    """Return the error for a record that goes past the end of its file.
+
+    The first bytes alone do not say that a file is compressed: they may be a record's length.
+
+    :param begin: the first two bytes of the file
+    """
+    if begin == GZIP:
+        return ValueError(
+            f"{file} is compressed by gzip as a whole; unpack it first, for example by "
+            f"`gunzip < {file.name} > unpacked/{file.name}`"
+        )
+    if begin == ZLIB:
+        return ValueError(f"{file} is compressed by zlib as a whole; write it without compression")
+    return ValueError(f"{file} is cut short: a record at byte {at} goes past its end")
 
 
 def _is_single(data: memoryview) -> bool:

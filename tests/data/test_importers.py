@@ -797,7 +797,7 @@ def example_class():
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Example"))
 
 
-def save_rlds(path, trajectories, form="png", cameras=("image",), scale=1.0, **more):
+def save_rlds(path, trajectories, form="png", cameras=("image",), scale=1.0, filler=9):
     """As TFDS writes them: the last step's action and reward are there and mean nothing."""
     example_type = example_class()
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -818,7 +818,7 @@ def save_rlds(path, trajectories, form="png", cameras=("image",), scale=1.0, **m
             feature["steps/is_last"].int64_list.value.extend(ends)
             terminal = [0] * (steps - 1) + [int(t.terminated)]
             feature["steps/is_terminal"].int64_list.value.extend(terminal)
-            feature["episode_metadata/file_path"].bytes_list.value.append(b"somewhere")
+            feature["episode_metadata/file_path"].bytes_list.value.append(bytes(filler))
             writer.write(example.SerializeToString())
         writer.flush()
 
@@ -841,6 +841,21 @@ def test_rlds_episodes_keep_to_the_chain_and_the_last_action_means_nothing(tmp_p
     assert new[2].embodiment == "arm"
     assert new[2].source == "1.0.0/chain-train.tfrecord-00001-of-00002 at byte 12"
     assert len(TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", **SMALL)) == 4
+
+
+@pytest.mark.parametrize("begin", [b"\x1f\x8b", b"\x78\x9c"], ids=["gzip", "zlib"])
+def test_a_record_whose_length_looks_like_a_compressed_file_is_read(tmp_path, begin):
+    old = chain(5)
+    length = int.from_bytes(begin, "little")
+    path = tmp_path / "a.tfrecord"
+    save_rlds(path, [old], filler=length)
+    save_rlds(path, [old], filler=2 * length - (path.stat().st_size - 16))
+    assert path.read_bytes()[:8] == length.to_bytes(8, "little")
+    [new] = open_episodes(tmp_path, **SMALL)
+    check_same(new, old)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="is compressed by"):
+        open_episodes(tmp_path)
 
 
 def test_rlds_actions_are_rescaled_from_the_limits_given(tmp_path):
@@ -887,7 +902,7 @@ def test_a_damaged_image_or_record_of_rlds_is_named(tmp_path):
     at = content.index(b"IDAT")
     content[at + 6 : at + 20] = bytes(14)
     (tmp_path / "a.tfrecord").write_bytes(content)
-    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12: image 0 is damaged"):
+    with pytest.raises(ValueError, match=r"a\.tfrecord at byte 12: one of its images is damaged"):
         open_episodes(tmp_path, **SMALL)[0]
     content[12] = 0x0F  # a field of a kind that does not exist
     (tmp_path / "a.tfrecord").write_bytes(content)

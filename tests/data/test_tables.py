@@ -13,7 +13,10 @@ from chain import chain, follows
 from PIL import Image
 
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.images import Resizer
+from wpt_agents.data.importers.episodes import as_images
 from wpt_agents.data.importers.formats import open_episodes, recognise
+from wpt_agents.data.importers.rows import read_images
 
 h5py = pytest.importorskip("h5py")
 SMALL = {"image_size": 8}
@@ -132,13 +135,32 @@ def test_compressed_images_of_aloha_are_decoded(tmp_path, padded):
     assert jpeg[..., 2].max() < 8  # red stays red
 
 
+def test_images_are_read_in_parts_and_black_ones_are_black_in_floats_too():
+    old = chain(200)
+    image = old.image.astype(np.float32)
+    image[64:128] = 0  # a part that does not say whether 1 or 255 is white
+    read = []
+
+    class Rows:
+        shape = image.shape
+
+        def __getitem__(self, chosen):
+            read.append(chosen.stop - chosen.start)
+            return image[chosen]
+
+    pieces = [(Rows(), 1, 200), (Rows(), 200, 201)]
+    seen = read_images(pieces, lambda part: as_images(part, Resizer(8)))
+    np.testing.assert_array_equal(seen, image[1:])
+    assert sum(read) == 200 and max(read) == 64
+
+
 def test_a_damaged_file_of_an_image_is_named(tmp_path):
     old = chain(5)
     files = as_files(old.image[:-1], "PNG")
     images = np.stack([np.pad(file, (0, 200 - len(file))) for file in files])
     images[3] = 0
     path = save(tmp_path / "a.hdf5", {"action": old.action, "observations/images/top": images})
-    with pytest.raises(ValueError, match=r"a\.hdf5: image 3 is damaged: cannot identify"):
+    with pytest.raises(ValueError, match=r"a\.hdf5: one of its images is damaged: cannot identify"):
         open_episodes(path, **SMALL)[0]
 
 

@@ -22,8 +22,9 @@ def resized(images: np.ndarray, size: int) -> np.ndarray:
     _, height, width, channels = images.shape
     rows, columns = area_weights(height, size), area_weights(width, size)
     parts = []
-    for at in range(0, len(images), CHUNK):
-        pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + CHUNK])).float()
+    chunk = max(1, CHUNK * 256**2 // max(height * width, 256**2))  # fewer images if they are large
+    for at in range(0, len(images), chunk):
+        pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + chunk])).float()
         count = len(pixels)
         # The average over an area separates into one product for each axis.
         pixels = rows @ pixels.reshape(count, height, width * channels)

@@ -255,7 +255,7 @@ def decoded(pictures: Iterable[bytes], resize: Resizer) -> np.ndarray:
         try:
             picture = np.array(reader.open(io.BytesIO(data)).convert("RGB"))
         except (OSError, SyntaxError) as error:
-            raise ValueError(f"image {len(images)} is damaged: {error}") from error
+            raise ValueError(f"one of its images is damaged: {error}") from error
         images.append(resize(picture[None]))
     return np.concatenate(images)
 
@@ -279,7 +279,7 @@ def _as_bytes(image: np.ndarray) -> np.ndarray:
     if image.dtype == np.uint8:
         return image
     least, most = float(image.min()), float(image.max())
-    whole = image.dtype.kind in "fiu" and 0 <= least and 1 < most <= 255
+    whole = image.dtype.kind in "fiu" and 0 <= least and (1 < most <= 255 or most == 0)
     if whole and np.array_equal(image, np.rint(image)):
         return image.astype(np.uint8)  # Diffusion Policy stores bytes as float32
     scale = "255 * image" if 0 <= least and most <= 1 else "(image - low) / (high - low) * 255"

@@ -8,6 +8,7 @@ actions; without it that action is dropped, and no terminal state is seen.
 """
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -19,7 +20,10 @@ from wpt_agents.data.importers.keys import Keys, Table, count, first
 
 LAST = 2  # dm_env's step type
 MARKS = ("step_type", "is_first", "reset")  # of files whose actions led to their observation
+CHUNK = 64  # images that are read at once
 EXAMINED = 100  # episodes whose first actions are read
+
+Pieces = Sequence[tuple[Any, int, int]]  # arrays of images, and the rows to take of them
 
 
 @dataclass(frozen=True)
@@ -168,11 +172,26 @@ def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarr
     return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
 
+def read_images(pieces: Pieces, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the images of an episode, read and converted in parts, as they may be large.
+
+    :param convert: n images -> (n, S, S, 3) uint8
+    """
+    parts = [
+        convert(np.asarray(array[at : min(at + CHUNK, stop)]))
+        for array, start, stop in pieces
+        for at in range(start, stop, CHUNK)
+    ]
+    if not parts:
+        raise ValueError("there are no images")
+    return np.concatenate(parts)
+
+
 def episode(
     table: Table, columns: Keys, start: int, stop: int, shifted: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
+) -> tuple[Pieces, np.ndarray, np.ndarray | None, bool]:
     """Return images, actions, rewards and the terminal flag of some rows in our convention."""
-    image = np.asarray(table[columns.image][start:stop])
+    image = [(table[columns.image], start, stop)]
     action = read_actions(table, columns, start, stop)
     reward = None if columns.reward is None else np.asarray(table[columns.reward][start:stop])
     if shifted:
@@ -182,9 +201,8 @@ def episode(
         return image, action[1:], None if reward is None else reward[1:], over
     if columns.next_image is None:
         return image, action[:-1], None if reward is None else reward[:-1], False
-    last = np.asarray(table[columns.next_image][stop - 1 : stop])
-    over = _is_flagged(table, columns, stop - 1)
-    return np.concatenate([image, last]), action, reward, over
+    image.append((table[columns.next_image], stop - 1, stop))
+    return image, action, reward, _is_flagged(table, columns, stop - 1)
 
 
 def _is_flagged(table: Table, columns: Keys, row: int) -> bool:
@@ -194,7 +212,7 @@ def _is_flagged(table: Table, columns: Keys, row: int) -> bool:
 
 def whole(
     table: Table, columns: Keys, where: str, shifted: bool | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
+) -> tuple[Pieces, np.ndarray, np.ndarray | None, bool]:
     """Return the only episode of a table, with as many images as actions or one more."""
     rows = count(table[columns.actions[0]])
     images = count(table[columns.image])
@@ -202,7 +220,7 @@ def whole(
         reward: Any = None if columns.reward is None else np.asarray(table[columns.reward][:rows])
         flags = 0 if columns.terminal is None else count(table[columns.terminal])
         over = _is_flagged(table, columns, flags - 1)  # there may be a flag for each image
-        image = np.asarray(table[columns.image][:])
+        image = [(table[columns.image], 0, images)]
         return image, read_actions(table, columns, 0, rows), reward, over
     if images != rows:
         raise ValueError(f"{where} has {rows} actions for {images} images")

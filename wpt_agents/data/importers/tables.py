@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from wpt_agents.data.importers import rows
-from wpt_agents.data.importers.episodes import Episodes, warn_left_out
+from wpt_agents.data.importers.episodes import Episodes, as_images, warn_left_out
 from wpt_agents.data.importers.keys import (
     ENDS,
     Keys,
@@ -158,7 +158,11 @@ class TableEpisodes(Episodes):
             start, stop = place.bounds
             source = f"{name} rows {start} to {stop - 1}"
             episode = rows.episode(table, place.keys, start, stop, bool(place.shifted))
-        image, action, reward, terminated = episode
+        pieces, action, reward, terminated = episode
+        try:
+            image = rows.read_images(pieces, lambda images: as_images(images, self._resize))
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
         return self._trajectory(
             image, action, reward, source, terminated=terminated, task=self.task or place.task
         )

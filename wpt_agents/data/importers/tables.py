@@ -62,7 +62,8 @@ class TableEpisodes(Episodes):
                 name = "" if str(error).startswith(str(file)) else f"{file}: "
                 raise ValueError(f"{name}{error}") from error
         warn_left_out(left_out, path)
-        if self._doubtful and all(self._doubtful):
+        # One episode may well begin so.
+        if self._doubtful and all(self._doubtful) and len(self._places) > 1:
             warnings.warn(
                 f"{path}: the first action of every episode is zero. If it is a placeholder, the "
                 "action of a row led to its observation, and shifted=True (--shifted) is needed; "

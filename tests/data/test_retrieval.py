@@ -140,6 +140,24 @@ def test_the_index_of_another_encoder_is_refused_with_the_remedy(tmp_path):
         Retriever.load(tmp_path / "index", "e2")
 
 
+def test_a_damaged_index_beside_a_dataset_is_built_again(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "data", image_size=8) as dataset:
+        for seed in range(3):
+            dataset.append(chain(5, seed))
+
+    def embed(image):
+        return image.reshape(len(image), -1)[:, :4].astype(np.float32)
+
+    whole = Retriever.beside(dataset, embed, "abc")
+    path = tmp_path / "data" / "retrieval-abc.index"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=r"built again: .*retrieval-abc\.index is damaged"):
+        again = Retriever.beside(dataset, embed, "abc")
+    np.testing.assert_array_equal(again.features, whole.features)
+    np.testing.assert_array_equal(Retriever.load(path, "abc").features, whole.features)
+
+
 def test_another_kind_of_file_is_refused(tmp_path):
     ReplayBuffer().save(tmp_path / "index")
     with pytest.raises(ValueError, match="it holds a ReplayBuffer"):

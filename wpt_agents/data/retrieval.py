@@ -84,7 +84,7 @@ class Retriever:
         encoder_id: str,
         progress_bar: bool = False,
     ) -> "Retriever":
-        """Load the index in the dataset's folder; build and save it if missing or out of date.
+        """Load the index in the dataset's folder; build it if missing, damaged or out of date.
 
         The index of a subset is built each time, since the folder holds that of the whole dataset.
         """
@@ -92,9 +92,12 @@ class Retriever:
         path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
         whole = not dataset.is_subset
         if whole and path.exists():
-            retriever = cls.load(path, encoder_id)
-            if retriever.dataset_id == dataset.fingerprint:
-                return retriever
+            try:
+                retriever = cls.load(path, encoder_id)
+                if retriever.dataset_id == dataset.fingerprint:
+                    return retriever
+            except ValueError as error:
+                warnings.warn(f"The index is built again: {error}", stacklevel=2)
         retriever = cls.build(dataset, embed, encoder_id, progress_bar)
         try:
             if whole:

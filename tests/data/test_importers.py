@@ -95,6 +95,12 @@ def test_one_limit_without_the_other_is_refused(tmp_path, form, limit):
         open_episodes(tmp_path, form, **{limit: [1.0, 1.0]})
 
 
+@pytest.mark.parametrize(("low", "high"), [(1, -1), ([-1, 2], [1, 1]), ([-1, 2], 1)])
+def test_limits_that_were_exchanged_are_refused(tmp_path, low, high):
+    with pytest.raises(ValueError, match=r"low is above high in dimension [01], .*; exchange them"):
+        open_episodes(tmp_path, "npz", low=low, high=high)
+
+
 def test_a_missing_package_is_asked_for_by_name():
     with pytest.raises(ImportError, match="Reading smoke needs nowhere_to_be: pip install"):
         needs("nowhere_to_be.found", "smoke")

@@ -46,7 +46,7 @@ def test_the_remedy_for_images_of_another_form_works(make):
 
 
 def test_a_reward_too_large_for_float32_is_refused():
-    with pytest.raises(ValueError, match="reward must be finite"):
+    with pytest.raises(ValueError, match=r"reward must be finite .* with 1 of inf; pass None"):
         Trajectory(IMAGE, ACTION, np.array([0, 1e300, 0]))
 
 

@@ -81,9 +81,11 @@ class Trajectory:
             raise ValueError(f"Trajectory.action must be numbers, got {action.dtype}")
         check_range(action)
         if reward is not None and (reward.shape != (len(action),) or not np.isfinite(reward).all()):
+            odd = reward[~np.isfinite(reward)]
             raise ValueError(
                 f"Trajectory.reward must be finite and of shape ({len(action)},), got "
-                f"{reward.shape}; pass None when rewards are unknown"
+                f"{reward.shape}{f' with {len(odd)} of {odd[0]}' if len(odd) else ''}; pass None "
+                "when rewards are unknown"
             )
         if not 0 <= self.action_dim <= action.shape[1]:
             raise ValueError(f"action_dim {self.action_dim} exceeds the width {action.shape[1]}")

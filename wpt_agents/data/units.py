@@ -23,7 +23,7 @@ ENOUGH = 20  # actions; the range of fewer says nothing
 def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
     """The limits of the actions as arrays, or None if neither is set.
 
-    :raises ValueError: one without the other
+    :raises ValueError: one without the other, or a lowest value above the highest
     """
     if low is None and high is None:
         return None
@@ -32,7 +32,13 @@ def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
             f"low and high, the limits of the actions, belong together; got low={low} and "
             f"high={high}"
         )
-    return np.atleast_1d(np.asarray(low, np.float64)), np.atleast_1d(np.asarray(high, np.float64))
+    least = np.atleast_1d(np.asarray(low, np.float64))
+    most = np.atleast_1d(np.asarray(high, np.float64))
+    comparable = least.shape == most.shape or 1 in (least.size, most.size)
+    if comparable and (least > most).any():
+        i = int(np.flatnonzero(least > most)[0])
+        raise ValueError(f"low is above high in dimension {i}, {low} and {high}; exchange them")
+    return least, most
 
 
 def rescaled(action: np.ndarray, low: Any, high: Any) -> np.ndarray:

@@ -244,6 +244,27 @@ def test_an_empty_demo_of_robomimic_is_left_out(tmp_path):
     check(new, chain(5, 0))
 
 
+def test_a_damaged_chunk_of_hdf5_is_named_and_can_be_skipped(tmp_path):
+    old = [chain(5, 0), chain(7, 1), chain(6, 2)]
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        for i, t in enumerate(old):
+            file[f"data/demo_{i}/actions"] = t.action
+            images = file.create_dataset(
+                f"data/demo_{i}/obs/agentview_image", data=t.image[:-1], compression="gzip"
+            )
+            if i == 1:
+                chunk = images.id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(content)
+    remedy = r"a\.hdf5 data/demo_1 cannot be read: .*hdf5plugin.* skip=\[1\]"
+    with pytest.raises(ValueError, match=remedy):
+        TrajectoryDataset.from_hdf5(path, tmp_path / "out", **SMALL)
+    data = TrajectoryDataset.from_hdf5(path, tmp_path / "out", skip=[1], **SMALL)
+    assert data.lengths.tolist() == [4, 5]
+
+
 def test_links_in_hdf5_are_followed_and_a_broken_one_is_named(tmp_path):
     old = [chain(5, 0), chain(7, 1)]
     save_robomimic(tmp_path / "b.hdf5", old)

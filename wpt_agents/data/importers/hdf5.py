@@ -9,6 +9,8 @@
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,9 @@ class Hdf5Episodes(TableEpisodes):
     A folder is searched for `.hdf5` and `.h5` files.
     """
 
+    remedy = (
+        ". If it is not damaged but compressed by a filter that HDF5 lacks, pip install hdf5plugin"
+    )
     _handle: Any = None
 
     def _list(self, path: Path) -> Sequence[Path]:
@@ -37,6 +42,8 @@ class Hdf5Episodes(TableEpisodes):
 
     def _read(self, file: Path) -> Table:
         h5py = needs("h5py", "HDF5 files")
+        with suppress(ImportError):
+            import_module("hdf5plugin")  # registers further filters
         if self._handle is not None:
             self._handle.close()
         try:

@@ -211,7 +211,7 @@ def _is_flagged(table: Table, columns: Keys, row: int) -> bool:
 
 
 def whole(
-    table: Table, columns: Keys, where: str, shifted: bool | None
+    table: Table, columns: Keys, shifted: bool | None
 ) -> tuple[Pieces, np.ndarray, np.ndarray | None, bool]:
     """Return the only episode of a table, with as many images as actions or one more."""
     rows = count(table[columns.actions[0]])
@@ -223,5 +223,5 @@ def whole(
         image = [(table[columns.image], 0, images)]
         return image, read_actions(table, columns, 0, rows), reward, over
     if images != rows:
-        raise ValueError(f"{where} has {rows} actions for {images} images")
+        raise ValueError(f"{rows} actions for {images} images")
     return episode(table, columns, 0, rows, bool(shifted))

@@ -43,6 +43,8 @@ class TableEpisodes(Episodes):
         convention, instead of the one that was taken at it; inferred for `step_type` if None
     """
 
+    remedy = ""  # what to do where arrays cannot be read
+
     def __init__(
         self, path: str | os.PathLike[str], shifted: bool | None = None, **options: Any
     ) -> None:
@@ -151,22 +153,29 @@ class TableEpisodes(Episodes):
                 for name, array in table.items()
                 if name.startswith(place.group + "/")
             }
-        name = place.file.name if place.file == self._root else self._relative(place.file)
-        if place.bounds is None:
-            source = f"{name} {place.group}" if place.group else name
-            episode = rows.whole(table, place.keys, source, place.shifted)
-        else:
-            start, stop = place.bounds
-            source = f"{name} rows {start} to {stop - 1}"
-            episode = rows.episode(table, place.keys, start, stop, bool(place.shifted))
-        pieces, action, reward, terminated = episode
+        source = self._source(place)
         try:
+            if place.bounds is None:
+                episode = rows.whole(table, place.keys, place.shifted)
+            else:
+                episode = rows.episode(table, place.keys, *place.bounds, bool(place.shifted))
+            pieces, action, reward, terminated = episode
             image = rows.read_images(pieces, lambda images: as_images(images, self._resize))
+        except (OSError, RuntimeError) as error:  # of h5py, and of zarr's codecs
+            raise ValueError(f"{source} cannot be read: {error}{self.remedy}") from error
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from error
         return self._trajectory(
             image, action, reward, source, terminated=terminated, task=self.task or place.task
         )
+
+    def _source(self, place: Place) -> str:
+        """Return the name of an episode: its file, and its group or rows in it."""
+        name = place.file.name if place.file == self._root else self._relative(place.file)
+        if place.bounds is not None:
+            start, stop = place.bounds
+            return f"{name} rows {start} to {stop - 1}"
+        return f"{name} {place.group}" if place.group else name
 
     def _relative(self, file: Path) -> str:
         return file.relative_to(self._root).as_posix()

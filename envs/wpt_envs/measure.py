@@ -21,7 +21,11 @@ THE_FOUR = (  # the tasks on which speed is reported
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB, infinite for equal pictures."""
+    """Return the peak signal-to-noise ratio in dB, infinite for equal pictures.
+
+    :param image: (H, W, 3) uint8
+    :param reference: (H, W, 3) uint8
+    """
     error = np.mean((image.astype(np.float64) - reference) ** 2)
     return float(10 * np.log10(255**2 / error)) if error else float("inf")
 

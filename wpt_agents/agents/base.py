@@ -115,7 +115,12 @@ class PixelAgent(SavedAgent):
         :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
+        :param tb_log_name: name of the run's folder in `tensorboard_log`
+        :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
+        :param progress_bar: show a progress bar
         :return: the agent itself
+        :raises ValueError: no environment, or rewards that are not finite
+        :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with self.learning(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
@@ -292,5 +297,8 @@ class PixelAgent(SavedAgent):
         self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Replace the replay buffer by the episodes in a file of `save_replay_buffer`."""
+        """Replace the replay buffer by the episodes in a file of `save_replay_buffer`.
+
+        :raises ValueError: a file that is cut short, damaged, or not a replay buffer
+        """
         self.replay_buffer = ReplayBuffer.load(path)

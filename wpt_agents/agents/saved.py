@@ -161,6 +161,8 @@ class SavedAgent(KeywordAgent):
 
         If its actions have another width, what was learnt and collected for a task is discarded.
 
+        :param env: an id, a Gymnasium environment, a vector environment, or a list of environments
+        :param force_reset: reset the environment at the next call of `learn`
         :raises ValueError: observations that are not images, or actions that are not a bounded Box
         """
         self._use_env(self._checked(env), force_reset)
@@ -231,8 +233,10 @@ class SavedAgent(KeywordAgent):
         :param path: the path passed to `save`, or the name of a pre-trained world model that comes
             with the library, such as "metaworld-mid"
         :param env: the environment to continue with
+        :param device: "auto", "cpu", "cuda", ...
         :param custom_objects: ignored; accepted because SB3 has it
         :param print_system_info: print this system's versions, as SB3 does
+        :param force_reset: reset the environment at the next call of `learn`
         :param kwargs: new values for keywords of the constructor, also `dataset`
         :raises ValueError: a file that is cut short, damaged or another agent's; unknown keywords
         :raises FileNotFoundError: no such file; for a folder, the message lists the files in it

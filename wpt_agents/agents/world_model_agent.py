@@ -243,10 +243,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     ) -> tuple[np.ndarray, State]:
         """Return actions for observations, and the recurrent state for the next call, as in SB3.
 
-        :param observation: images (64, 64, 3) or (n, 64, 64, 3), or a Dict with one image
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8, or a Dict with one image; channels
+            first and other sizes are converted
         :param state: the state that the last call returned; None at the start of an episode
         :param episode_start: (n,) bool, the environments whose episode has just begun
         :param deterministic: act by the most likely latent state and the mean action
+        :return: (A,) or (n, A) in the bounds of the environment's actions, and the next state
+        :raises ValueError: an observation that is not an image, a state of another number of
+            environments, or weights that are not finite
         """
         with self.operations():
             return self.policy.predict(observation, state, episode_start, deterministic)
@@ -257,7 +261,10 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         return PriorPolicy(self.policy) if self.progress.cloned else None
 
     def build_index(self, progress_bar: bool = False) -> Retriever:
-        """Return the index of the dataset's first images, which is kept beside the dataset."""
+        """Return the index of the dataset's first images, which is kept beside the dataset.
+
+        :raises ValueError: the agent has no dataset
+        """
         if self.dataset is None:
             raise ValueError("No dataset to index: pass dataset= to load or WPT")
         policy = self.policy

@@ -98,15 +98,19 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :param env: the environment to continue with, if known
         :param steps: number of updates in total; if None, it depends on the size (200,000 for
             `paper`)
+        :param size: widths of all networks, as the keyword of `WPT`
         :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
             on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
             If a model is there, training continues from it, on any number of processes
+        :param seed: seed of all random numbers; None: a random seed
+        :param progress_bar: show a progress bar
         :param callback: called after every update with (step, metrics)
         :param accumulate: passes over a batch, or a process's share of it, to save memory
         :param kwargs: keywords of `WPT`, also `tensorboard_log`; `batch_size` is that of all
             processes and passes together
         :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
             with other images or wider actions; an unknown keyword; a batch that cannot be divided
+        :raises FloatingPointError: a loss or gradient that is not finite; the last checkpoint stays
         """
         cls.check_keywords(kwargs)
         device = local_device(kwargs.pop("device", "auto"))
@@ -143,8 +147,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
         :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
         :param callback: SB3's callbacks
-        :param log_interval: episodes between two dumps of the log
+        :param log_interval: stored episodes between two dumps of the log
+        :param tb_log_name: name of the run's folder in `tensorboard_log`
+        :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
+        :param progress_bar: show a progress bar of each stage
         :return: the model itself
+        :raises ValueError: no environment, or rewards that are not finite
+        :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with (
             self.operations(),
@@ -225,7 +234,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return "the prior actor's actions" if guided else super().warmup_driver
 
     def guide(self, frames: np.ndarray) -> np.ndarray:
-        """Act as the prior actor; at random in the warm-up if there is none."""
+        """Act as the prior actor, or at random without one: (k, F, 64, 64, 3) -> (k, A)."""
         return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)
 
     # // Update Models
@@ -293,7 +302,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     # The data and the task
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another D_off, of any kind that the keyword `dataset` takes."""
+        """Use another D_off, of any kind that the keyword `dataset` takes; None changes nothing.
+
+        :raises ValueError: a dataset with other images, wider actions or too short trajectories
+        """
         super().set_dataset(dataset)
         if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
             self.retrieved = None
@@ -311,6 +323,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
         :param keep_data: keep the collected episodes as reward-free data beside the dataset, so
             that the next task's trajectories are retrieved from both
+        :raises ValueError: `keep_data` without a dataset
         """
         if keep_data and self.dataset is None:
             raise ValueError("keep_data=True keeps episodes beside a dataset: pass dataset= first")
@@ -327,6 +340,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
         The episodes are kept only if the agent has a dataset. Schedules and the count of steps
         begin again.
+
+        :param env: the environment of the next task, in any form that `set_env` takes
         """
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)

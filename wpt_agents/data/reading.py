@@ -209,6 +209,7 @@ class StoredTrajectories:
         :param batch_size: number of sequences
         :param length: number of images in a sequence
         :param action_width: width to which actions are padded
+        :param seed: seed of the random numbers
         :param purpose: a different number for each use that shares the seed
         :param start: the number of the first batch
         :param ahead: number of batches that are prepared in the background

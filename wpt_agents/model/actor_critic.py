@@ -144,7 +144,11 @@ def actor_weight(gamma: float, like: Tensor, goes_on: Tensor | None = None) -> T
 
 
 def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -> Tensor:
-    """Return the range between two quantiles of the returns, by which DreamerV3 divides them."""
+    """Return the range between two quantiles of the returns, by which DreamerV3 divides them.
+
+    :param lambda_return: (B, H); no gradient reaches it
+    :return: scalar
+    """
     quantiles = torch.quantile(
         lambda_return.detach().flatten(),
         torch.tensor([low, high], device=lambda_return.device),

@@ -18,12 +18,12 @@ from wpt_agents.model.sizes import Size
 
 
 def to_unit(image: Tensor) -> Tensor:
-    """Convert uint8 pixels to float32 in [-0.5, 0.5]."""
+    """Convert pixels: (...) uint8 -> (...) float32 in [-0.5, 0.5]."""
     return image.float().div_(255).sub_(0.5)
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """Invert `to_unit`, rounding and clipping."""
+    """Invert `to_unit`, rounding and clipping: (...) float32 -> (...) uint8."""
     return ((image + 0.5) * 255).round().clamp(0, 255).to(torch.uint8)
 
 

@@ -38,7 +38,14 @@ class PriorPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, State]:
-        """Act as `WPTPolicy.predict`; the clone is deterministic in any case."""
+        """Return the prior actor's action, which is always deterministic, and the next state.
+
+        :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8, or a Dict with one image
+        :param state: what the last call returned; None at the start of an episode
+        :param episode_start: (n,) bool, the environments whose episode has just begun
+        :param deterministic: has no effect; accepted because SB3 has it
+        :return: (A,) or (n, A) in the bounds of the environment's actions, and the next state
+        """
         images, batched = to_images(observation, self.policy.image_key)
         frames = stack_frames(images, state[0] if state else None, episode_start)
         action = self.policy.to_env(prior_action(self.policy, frames))

@@ -204,7 +204,11 @@ class RSSM(nn.Module):
 
 
 def draw_code(logits: Tensor, generator: Noise, sample: bool) -> Tensor:
-    """Draw z from its distribution, or take the most likely class of each group."""
+    """Draw z from its distribution, or take the most likely class of each group.
+
+    :param logits: (..., S, K) log-probabilities
+    :return: (..., S, K), one-hot
+    """
     return sample_one_hot(logits, generator) if sample else mode_one_hot(logits)
 
 

@@ -133,6 +133,9 @@ class Learner(WorldModelLearner):
         """Kickstarting: how far an actor is from the prior actor on the replayed images.
 
         The paper does not have it. Source: https://arxiv.org/abs/1803.03835
+
+        :param post: (B, T, ...), the states of the replayed steps
+        :param advice: (B (T - 2), A), the prior actor's actions, which need three images
         """
         mask = self.policy.action_mask
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)

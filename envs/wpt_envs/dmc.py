@@ -124,7 +124,9 @@ class DMControl(Simulated):
         """Start an episode; a seed s sets the task's `numpy.random.RandomState(s)`."""
         seed = self._seeded(seed)
         if seed is not None:
-            self.dm_env.task.random.seed(seed)
+            # RandomState takes seeds of 32 bits only, Gymnasium larger ones, too
+            words = [seed >> shift & 0xFFFFFFFF for shift in range(0, seed.bit_length(), 32)]
+            self.dm_env.task.random.seed(words if len(words) > 1 else seed)
         timestep = self.dm_env.reset()
         self.view.upload_terrain()
         return _flat(timestep.observation), {}

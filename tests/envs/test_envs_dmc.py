@@ -95,6 +95,14 @@ def test_every_stock_task_of_a_domain_is_in_the_table(domain):
     assert stock_names(domain) == {stock_name(task) for task in STOCK if task.embodiment == domain}
 
 
+def test_a_seed_of_more_than_32_bits_is_a_seed_of_its_own():
+    env = gym.make("wpt/dmc-cartpole-swingup-v0", state_in_info=True)
+    states = [env.reset(seed=seed)[1]["state"] for seed in (2**40 + 3, 2**40 + 3, 2**41 + 3, 3)]
+    env.close()
+    assert np.array_equal(states[0], states[1])
+    assert len({state.tobytes() for state in states}) == 3
+
+
 def test_the_constructors_seed_is_used_once():
     env = gym.make("wpt/dmc-acrobot-swingup-v0", seed=7).unwrapped
     first, second = env.reset()[0], env.reset()[0]

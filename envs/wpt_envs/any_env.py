@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 
 from wpt_envs.pictures import PictureReader, shrink
 from wpt_envs.simulation import find_simulation, model_and_data, usual_camera
@@ -99,11 +100,12 @@ def _instead(env: Any) -> str:
     return f"a {type(env).__name__}"
 
 
-class _LookRendered(gym.Wrapper):
+class _LookRendered(gym.Wrapper, RecordConstructorArgs):
     """Take images from `env.render()`."""
 
     def __init__(self, env: gym.Env, crop: bool = False) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, crop=crop)
+        gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(
                 f"{env} has render_mode={env.render_mode!r}; make it with render_mode='rgb_array'"
@@ -116,11 +118,12 @@ class _LookRendered(gym.Wrapper):
         return shrink(self._reader.read(self.env.render()), size)
 
 
-class _LookObserved(gym.Wrapper):
+class _LookObserved(gym.Wrapper, RecordConstructorArgs):
     """Take images from one entry of the Dict observations."""
 
     def __init__(self, env: gym.Env, image_key: str, crop: bool = False) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, image_key=image_key, crop=crop)
+        gym.Wrapper.__init__(self, env)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
             raise ValueError(
@@ -153,11 +156,12 @@ class _LookObserved(gym.Wrapper):
         return shrink(self._seen, size)
 
 
-class _LookDrawn(gym.Wrapper):
+class _LookDrawn(gym.Wrapper, RecordConstructorArgs):
     """Draw images with this package's renderer."""
 
     def __init__(self, env: gym.Env, rendering: str, camera: "Camera | None" = None) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, rendering=rendering, camera=camera)
+        gym.Wrapper.__init__(self, env)
         self._simulation = find_simulation(env.unwrapped)
         if self._simulation is None:
             raise ValueError(

@@ -179,6 +179,18 @@ def test_any_mujoco_environment_is_drawn_by_our_renderer():
     env.close()
 
 
+def test_an_environment_is_made_again_from_its_spec():
+    base = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env = wpt_envs.pixels(base, rendering="fast", camera={"distance": 3.0}, pad_action_to=3)
+    again = gym.make(env.spec)
+    assert np.array_equal(env.reset(seed=3)[0], again.reset(seed=3)[0])
+    assert again.action_space == env.action_space
+    assert str(again) == str(env)
+    for options in ({}, {"crop": True}):
+        cart = wpt_envs.pixels(gym.make("CartPole-v1", render_mode="rgb_array"), **options)
+        assert str(gym.make(cart.spec)) == str(cart)
+
+
 def test_rendering_answers_the_last_observation():
     env = SeePixels(wpt_envs.pixels(Count()).env, image_size=64)
     obs, _ = env.reset()

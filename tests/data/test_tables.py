@@ -232,6 +232,32 @@ def test_one_episode_with_flags_and_an_image_more_than_actions_is_whole(tmp_path
         open_episodes(path, **SMALL)
 
 
+def test_rows_of_one_episode_are_read_once_the_file_says_so(tmp_path):
+    old = chain(6)
+    path = save(tmp_path / "a.hdf5", rows([old]))
+    with pytest.raises(ValueError, match=r"add the array episode_ends = \[6\] to the file"):
+        open_episodes(path, **SMALL)
+    with h5py.File(path, "a") as file:
+        file["episode_ends"] = [6]
+    check(open_episodes(path, **SMALL)[0], old, 6)
+
+
+def test_groups_beside_numbered_ones_are_episodes_or_named(tmp_path):
+    old = [chain(5, 0), chain(7, 1), chain(6, 2)]
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        for name, t in zip(("1f", "a2", "bc"), old, strict=True):  # hexadecimal numbers
+            file[f"data/{name}/actions"] = t.action
+            file[f"data/{name}/obs/agentview_image"] = t.image[:-1]
+        file["data/d3/obs/agentview_image"] = t.image  # broken off
+        file["mask/e5/train"] = np.arange(3)
+    with pytest.warns(
+        UserWarning, match="1 groups of images without actions are left out, data/d3"
+    ):
+        new = list(open_episodes(tmp_path / "a.hdf5", **SMALL))
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected, len(expected))
+
+
 def test_an_empty_demo_of_robomimic_is_left_out(tmp_path):
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         for i, t in enumerate([chain(5, 0), chain(5, 1)]):

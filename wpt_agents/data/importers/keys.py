@@ -157,23 +157,37 @@ def natural(name: object) -> list[tuple[int, str | int]]:
     return [(1, int(part)) if part.isdigit() else (0, part) for part in parts]
 
 
-def by_group(table: Table, action_keys: tuple[str, ...]) -> dict[str, Table]:
-    """Return the groups that are one episode each, such as data/demo_0, in numeric order.
+def by_group(table: Table, action_keys: tuple[str, ...]) -> tuple[dict[str, Table], list[str]]:
+    """Find the groups that are one episode each, such as data/demo_0.
 
-    The name of such a group ends with a number, and the group contains actions.
+    One of them has a name that ends with a number; the others are beside it, as data/demo_1 is.
+
+    :return: the groups with actions, in numeric order, and the names of those with images alone
     """
+    leaves = [leaf(key) for key in action_keys] or list(ACTIONS)
+
+    def acts(group: Table) -> bool:
+        return any(leaf(name) in leaves or name.split("/")[0] in leaves for name in group)
+
+    numbered = _grouped(table, r"((?:[^/]*\D/)*[^/]*\d)/(.+)")
+    parents = {group.rpartition("/")[0] for group, arrays in numbered.items() if acts(arrays)}
+    groups: dict[str, dict[str, Any]] = {}
+    for parent in parents:
+        start = re.escape(f"{parent}/" if parent else "")
+        groups |= _grouped(table, rf"({start}[^/]+)/(.+)")
+    names = sorted(groups, key=natural)
+    idle = [n for n in names if not acts(groups[n]) and any(map(is_images, groups[n].values()))]
+    return {name: groups[name] for name in names if acts(groups[name])}, idle
+
+
+def _grouped(table: Table, pattern: str) -> dict[str, dict[str, Any]]:
+    """Return the arrays of each group, by the pattern of the group's name and of an array in it."""
     groups: dict[str, dict[str, Any]] = {}
     for name, array in table.items():
-        numbered = re.match(r"((?:[^/]*\D/)*[^/]*\d)/(.+)", name)
-        if numbered:
-            groups.setdefault(numbered[1], {})[numbered[2]] = array
-    leaves = [leaf(key) for key in action_keys] or list(ACTIONS)
-    holding = [
-        group
-        for group, arrays in groups.items()
-        if any(leaf(name) in leaves or name.split("/")[0] in leaves for name in arrays)
-    ]
-    return {group: groups[group] for group in sorted(holding, key=natural)}
+        found = re.match(pattern, name)
+        if found:
+            groups.setdefault(found[1], {})[found[2]] = array
+    return groups
 
 
 def within(key: str, groups: Iterable[str]) -> str:

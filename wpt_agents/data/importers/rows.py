@@ -68,7 +68,8 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
         raise ValueError(
             "nothing says where episodes end: needs 'terminals', 'timeouts', 'terminations', "
             "'truncations', 'dones', 'step_type' or 'episode_ends', or done_key (--done-key); "
-            f"there are: {', '.join(table)}"
+            f"there are: {', '.join(table)}. If these rows are one episode, add the array "
+            f"episode_ends = [{rows}] to the file"
         )
     ends = np.concatenate([_ends(np.ravel(table[name][:]), name, rows) for name in names])
     # Flags leave an unfinished episode at the end; numbers name all episodes.

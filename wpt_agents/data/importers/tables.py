@@ -99,7 +99,13 @@ class TableEpisodes(Episodes):
         """Add the locations of a file's episodes; return the number of those without an action."""
         table = self._table(file)
         task = self._task(file)
-        groups = by_group(table, self.action_keys)
+        groups, idle = by_group(table, self.action_keys)
+        if idle:
+            warnings.warn(
+                f"{file}: {len(idle)} groups of images without actions are left out, {idle[0]} for "
+                "example",
+                stacklevel=4,
+            )
         if groups:
             return self._find_groups(file, groups, task)
         keys = find_keys(table, self.image_key, self.action_keys)

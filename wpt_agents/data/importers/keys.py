@@ -184,9 +184,9 @@ def _grouped(table: Table, pattern: str) -> dict[str, dict[str, Any]]:
     """Return the arrays of each group, by the pattern of the group's name and of an array in it."""
     groups: dict[str, dict[str, Any]] = {}
     for name, array in table.items():
-        found = re.match(pattern, name)
-        if found:
-            groups.setdefault(found[1], {})[found[2]] = array
+        matched = re.match(pattern, name)
+        if matched:
+            groups.setdefault(matched[1], {})[matched[2]] = array
     return groups
 
 

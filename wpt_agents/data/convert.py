@@ -233,11 +233,21 @@ def convert(
     return from_episodes(open_episodes(source, form, **options), path, progress_bar)
 
 
+DOOR = """Convert `{form}` data into a dataset; an interrupted conversion continues.
+
+:param source: the files: what `{reader}` takes
+:param path: the folder of the dataset
+:param progress_bar: show a progress bar
+:param options: keywords of every format (`embodiment`, `task`, `rewards`, `image_size`, `crop`,
+    `image_key`, `action_key`, `done_key`, `low`, `high`; see `Episodes`), `skip`, the numbers of
+    episodes to leave out, and those of `{reader}`
+:raises ValueError: data or options that cannot be used, or another dataset at `path`
+"""
+
+
 def _door(form: str) -> Callable[..., TrajectoryDataset]:
     door = partial(convert, form=form)
-    door.__doc__ = f"Convert `{form}` data at `source` into a dataset at `path`; " + (
-        f"`{FORMATS[form].__name__}` has the options."
-    )
+    door.__doc__ = DOOR.format(form=form, reader=FORMATS[form].__name__)
     return door
 
 

@@ -109,7 +109,7 @@ class Trajectory:
 
     @cached_property
     def background(self) -> np.ndarray:
-        """The median image, (H, W, 3) uint8, computed once, of 51 images evenly spaced."""
+        """The median of 51 evenly spaced images, (H, W, 3) uint8: what does not move."""
         times = np.linspace(0, len(self.image) - 1, min(GLANCES, len(self.image))).round()
         median: np.ndarray = np.median(self.image[times.astype(int)], 0)
         return median.astype(np.uint8)

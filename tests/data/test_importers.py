@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -671,6 +672,38 @@ def save_lerobot(folder, lengths, video=True, fps=10):
     return states
 
 
+def save_lerobot_2(folder, lengths, video=True, fps=10):
+    """Version 2.1: a table and a video for each episode, JSON lines about them; 2 in a chunk."""
+    pq = pytest.importorskip("pyarrow.parquet")
+    states = iter(save_lerobot(folder / "new", lengths, video, fps))
+    (folder / "meta").mkdir(parents=True)
+    info = json.loads((folder / "new/meta/info.json").read_text())
+    paths = ("chunk-{episode_chunk:03d}", "episode_{episode_index:06d}")
+    info |= {"codebase_version": "v2.1", "chunks_size": 2}
+    info["data_path"] = f"data/{paths[0]}/{paths[1]}.parquet"
+    info["video_path"] = f"videos/{paths[0]}/{{video_key}}/{paths[1]}.mp4"
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    lines, stats = [], []
+    for e, length in enumerate(lengths):
+        table = pq.read_table(folder / f"new/data/chunk-000/file-{min(e, 1):03d}.parquet")
+        table = table.filter(np.array(table["episode_index"]) == e)
+        names = {"episode_chunk": e // 2, "episode_index": e, "video_key": "front"}
+        path = folder / info["data_path"].format(**names)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, path)
+        seen = [next(states) for _ in range(length)]
+        if video:
+            write_video(folder / info["video_path"].format(**names), seen, fps)
+        lines.append({"episode_index": e, "tasks": [f"task {e}"], "length": length})
+        high = 11.0 if e == 1 else 9.0  # the extremes are those of all episodes
+        limits = {"min": [0.0, 5.0], "max": [high, 5.0], "count": [length]}
+        stats.append({"episode_index": e, "stats": {"action": limits}})
+    for name, content in (("episodes", lines), ("episodes_stats", stats)):
+        text = "\n".join(map(json.dumps, content))
+        (folder / f"meta/{name}.jsonl").write_text(text + "\n")
+    shutil.rmtree(folder / "new")
+
+
 def write_lerobot_meta(folder, video, fps, version="v3.0"):
     (folder / "meta").mkdir(parents=True, exist_ok=True)
     path = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -698,7 +731,7 @@ def png(state):
 
 def write_video(path, states, fps):
     av = pytest.importorskip("av")
-    path.parent.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=fps, options={"g": "4", "crf": "20"})
         stream.width = stream.height = 32
@@ -710,9 +743,10 @@ def write_video(path, states, fps):
 
 
 @pytest.mark.filterwarnings("ignore:LeRobot stored", "ignore:Images of 32 x 32 are resized")
+@pytest.mark.parametrize("save", [save_lerobot, save_lerobot_2], ids=["v3.0", "v2.1"])
 @pytest.mark.parametrize("video", [True, False])
-def test_lerobot_episodes_keep_to_the_chain_and_leave_each_last_action_out(tmp_path, video):
-    save_lerobot(tmp_path, [6, 9, 1, 5], video)
+def test_lerobot_episodes_keep_to_the_chain_and_leave_each_last_action_out(tmp_path, save, video):
+    save(tmp_path, [6, 9, 1, 5], video)
     with pytest.warns(UserWarning, match="1 episode of a single image left out"):
         new = list(open_episodes(tmp_path, **SMALL))
     assert [len(trajectory) for trajectory in new] == [5, 8, 4]
@@ -767,8 +801,8 @@ def test_an_older_lerobot_version_and_a_camera_that_is_not_there_are_named(tmp_p
     save_lerobot(tmp_path, [6], video=False)
     with pytest.raises(ValueError, match="0 cameras for camera='back'; give one of: front"):
         open_episodes(tmp_path, camera="back")
-    write_lerobot_meta(tmp_path, False, 10, version="v2.1")
-    with pytest.raises(ValueError, match=r"version v2\.1; convert it to v3\.0"):
+    write_lerobot_meta(tmp_path, False, 10, version="v1.6")
+    with pytest.raises(ValueError, match=r"version v1\.6; convert it to v2\.1"):
         open_episodes(tmp_path)
 
 

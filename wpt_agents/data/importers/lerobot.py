@@ -1,5 +1,7 @@
-"""LeRobot datasets of version 3: parquet tables, and mp4 videos or images in the tables.
+"""LeRobot datasets of versions 2 and 3: parquet tables, and mp4 videos or images in the tables.
 
+Version 2 has a table and a video for each episode, and JSON lines about the episodes; in version 3,
+tables and videos hold many episodes.
 Row t holds observation t and the action taken at it. There is no observation after the last action,
 so that action is dropped, and no terminal state is seen.
 """
@@ -42,12 +44,9 @@ class LeRobotEpisodes(Episodes):
         self._folder = Path(folder)
         self._info = json.loads(_text(self._folder / "meta" / "info.json"))
         version = str(self._info.get("codebase_version"))
-        # version 2 has a file for each episode, and other metadata
-        if not version.startswith("v3."):
-            raise ValueError(
-                f"{folder} is of version {version}; convert it to v3.0 with lerobot: "
-                "`python -m lerobot.scripts.convert_dataset_v21_to_v30` takes v2.1"
-            )
+        if not version.startswith(("v2.", "v3.")):
+            raise ValueError(f"{folder} is of version {version}; convert it to v2.1 with lerobot")
+        self._single = version.startswith("v2.")  # each file holds a single episode
         self._camera = self._choose(camera or self.image_key)
         self._actions = self._choose_actions()
         self._own_limits = None if self.limits is not None else self._read_limits()
@@ -90,28 +89,34 @@ class LeRobotEpisodes(Episodes):
 
     def _read_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the minimum and maximum actions, from the dataset's statistics."""
-        path = self._folder / "meta" / "stats.json"
-        stats = json.loads(_text(path)) if path.exists() else {}
-        missing = [name for name in self._actions if not {"min", "max"} <= set(stats.get(name, ()))]
+        meta = self._folder / "meta"
+        path = meta / "stats.json"
+        if path.exists():
+            parts = [json.loads(_text(path))]
+        else:  # version 2.1 has those of each episode
+            path = meta / "episodes_stats.jsonl"
+            parts = [line["stats"] for line in _lines(path)] if path.exists() else []
+        missing = [
+            name
+            for name in self._actions
+            if not parts or any(not {"min", "max"} <= set(part.get(name, ())) for part in parts)
+        ]
         if missing:
             raise ValueError(
                 f"{path} has no minimum and maximum of {missing[0]!r}; pass the limits of "
                 "the actions, low=[...] and high=[...] (--low, --high)"
             )
-        low = np.concatenate([np.ravel(stats[name]["min"]) for name in self._actions])
-        high = np.concatenate([np.ravel(stats[name]["max"]) for name in self._actions])
-        return low.astype(np.float64), high.astype(np.float64)
+        low, high = (
+            np.array([np.concatenate([np.ravel(p[a][end]) for a in self._actions]) for p in parts])
+            for end in ("min", "max")
+        )
+        return low.min(0).astype(np.float64), high.max(0).astype(np.float64)
 
     def _episodes(self, chosen: Sequence[int] | None) -> list[dict[str, Any]]:
-        files = sorted((self._folder / "meta" / "episodes").rglob("*.parquet"))
-        prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
-        rows = []
-        for file in files:
-            names = self._parquet.read_schema(file).names
-            columns = [name for name in names if name.startswith(prefixes)]
-            rows += self._parquet.read_table(file, columns=columns).to_pylist()
+        meta = self._folder / "meta"
+        rows = _lines(meta / "episodes.jsonl") if self._single else self._tabulated(meta)
         if not rows:
-            raise ValueError(f"{self._folder} has no episodes in meta/episodes")
+            raise ValueError(f"{self._folder} has no episodes in its folder meta")
         if chosen is not None:
             rows = [row for row in rows if row["episode_index"] in set(chosen)]
             missing = set(chosen) - {row["episode_index"] for row in rows}
@@ -120,6 +125,32 @@ class LeRobotEpisodes(Episodes):
         long = [row for row in rows if row["length"] > 1]
         warn_left_out(len(rows) - len(long), self._folder)
         return sorted(long, key=lambda row: int(row["episode_index"]))
+
+    def _tabulated(self, meta: Path) -> list[dict[str, Any]]:
+        """Return the rows about episodes in the tables of version 3."""
+        prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
+        rows = []
+        for file in sorted((meta / "episodes").rglob("*.parquet")):
+            names = self._parquet.read_schema(file).names
+            columns = [name for name in names if name.startswith(prefixes)]
+            rows += self._parquet.read_table(file, columns=columns).to_pylist()
+        return rows
+
+    def _file(self, row: dict[str, Any], kind: str, prefix: str) -> Path:
+        """Return an episode's table or video.
+
+        :param kind: `data_path` or `video_path`
+        :param prefix: of the columns that name the file, in version 3
+        """
+        number = row["episode_index"]
+        name: str = self._info[kind].format(
+            video_key=self._camera,
+            chunk_index=row.get(f"{prefix}chunk_index"),
+            file_index=row.get(f"{prefix}file_index"),
+            episode_chunk=number // self._info.get("chunks_size", 1000),
+            episode_index=number,
+        )
+        return self._folder / name
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -153,9 +184,7 @@ class LeRobotEpisodes(Episodes):
 
     def _table(self, row: dict[str, Any]) -> Any:
         """Return the episode's rows in order; the file is cached for the next episode."""
-        path = self._folder / self._info["data_path"].format(
-            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-        )
+        path = self._file(row, "data_path", "data/")
         if self._open is None or self._open[0] != path:
             names = self._parquet.read_schema(path).names
             usual = ("episode_index", "frame_index", "timestamp", "next.reward")
@@ -182,14 +211,9 @@ class LeRobotEpisodes(Episodes):
     def _video(self, row: dict[str, Any], table: Any, source: str) -> np.ndarray:
         """Return the episode's frames, each resized as soon as it is decoded."""
         prefix = f"videos/{self._camera}/"
-        path = self._folder / self._info["video_path"].format(
-            video_key=self._camera,
-            chunk_index=row[prefix + "chunk_index"],
-            file_index=row[prefix + "file_index"],
-        )
-        times = row[prefix + "from_timestamp"] + np.ravel(table["timestamp"].to_numpy()).astype(
-            np.float64
-        )
+        path = self._file(row, "video_path", prefix)
+        begin = 0.0 if self._single else row[f"{prefix}from_timestamp"]
+        times = begin + np.ravel(table["timestamp"].to_numpy()).astype(np.float64)
         images: list[np.ndarray] = []
         slack = 0.5 / self._info["fps"]  # half a frame, because time stamps may be rounded
         for time, frame in _frames(path, float(times[0]), slack):
@@ -215,7 +239,11 @@ def _frames(path: Path, start: float, slack: float) -> Iterator[tuple[float, np.
         raise ValueError(f"{path} cannot be read: {error}") from error
 
 
+def _lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in _text(path).splitlines() if line.strip()]
+
+
 def _text(path: Path) -> str:
     if not path.exists():
-        raise ValueError(f"{path} does not exist; is this a LeRobot dataset of version 3?")
+        raise ValueError(f"{path} does not exist; is this a LeRobot dataset of version 2 or 3?")
     return path.read_text(encoding="utf-8")

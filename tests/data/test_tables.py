@@ -5,7 +5,9 @@ Each is written in its program's own layout, from a known chain, and must come b
 
 import io
 import json
+import resource
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -149,9 +151,12 @@ def test_images_are_read_in_parts_and_black_ones_are_black_in_floats_too():
             return image[chosen]
 
     pieces = [(Rows(), 1, 200), (Rows(), 200, 201)]
-    seen = read_images(pieces, lambda part: as_images(part, Resizer(8)))
-    np.testing.assert_array_equal(seen, image[1:])
-    assert sum(read) == 200 and max(read) == 64
+    for chunks, rows_at_once in ((None, 64), ((10, 8, 8, 3), 64), ((100, 8, 8, 3), 100)):
+        Rows.chunks = chunks
+        read.clear()
+        seen = read_images(pieces, lambda part: as_images(part, Resizer(8)))
+        np.testing.assert_array_equal(seen, image[1:])
+        assert sum(read) == 200 and max(read) == rows_at_once
 
 
 def test_a_damaged_file_of_an_image_is_named(tmp_path):
@@ -291,15 +296,41 @@ def test_a_damaged_chunk_of_hdf5_is_named_and_can_be_skipped(tmp_path):
     assert data.lengths.tolist() == [4, 5]
 
 
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc, which Linux has")
+def test_reading_many_demos_takes_the_memory_of_one(tmp_path):
+    """HDF5 keeps chunks of every array that is open: 4.8 MB of each of these."""
+    images = np.zeros((60, 84, 84, 3), np.uint8)
+    images[:] = np.arange(84, dtype=np.uint8)[:, None, None]
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        for i in range(40):
+            file[f"data/demo_{i}/actions"] = np.full((60, 2), 0.5)
+            demo = file[f"data/demo_{i}"]
+            demo.create_dataset("obs/agentview_image", data=images, chunks=(1, 84, 84, 3))
+    episodes = open_episodes(tmp_path / "a.hdf5", image_size=84)
+    for i in range(5):
+        np.testing.assert_array_equal(episodes[i].image, images)
+    before = resident()
+    for i in range(5, 40):
+        assert len(episodes[i]) == 59
+    assert resident() - before < 40  # MiB
+
+
+def resident():
+    """The memory of this process in MiB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
 def test_links_in_hdf5_are_followed_and_a_broken_one_is_named(tmp_path):
     old = [chain(5, 0), chain(7, 1)]
     save_robomimic(tmp_path / "b.hdf5", old)
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
-        file["data/demo_0"] = h5py.ExternalLink("b.hdf5", "/data/demo_1")
-        file["data/demo_1"] = h5py.SoftLink("/data/demo_0")
+        for i in range(2):
+            file[f"data/demo_{i}"] = h5py.ExternalLink("b.hdf5", f"/data/demo_{1 - i}")
+        file["data/demo_2"] = h5py.SoftLink("/data/demo_0")
         file["data/all"] = h5py.SoftLink("/")
     new = list(open_episodes(tmp_path / "a.hdf5", **SMALL))
-    for episode, expected in zip(new, [old[1], old[1]], strict=True):
+    for episode, expected in zip(new, [old[1], old[0], old[1]], strict=True):
         check(episode, expected)
     (tmp_path / "b.hdf5").unlink()
     with pytest.raises(ValueError, match=r"a\.hdf5: the link 'demo_0' in '/data' leads nowhere"):

@@ -10,9 +10,12 @@
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from wpt_agents.data.importers.episodes import needs
 from wpt_agents.data.importers.keys import Table, natural
@@ -50,7 +53,10 @@ class Hdf5Episodes(TableEpisodes):
             self._handle = h5py.File(file, "r")
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
-        return dict(_arrays(self._handle, h5py.Dataset))
+        return {
+            name: Array(self._handle, name, array.shape, array.dtype, array.chunks)
+            for name, array in _arrays(self._handle, h5py.Dataset)
+        }
 
     def _task(self, file: Path) -> str | None:
         """Return LIBERO's instruction, or the name of robomimic's environment."""
@@ -62,6 +68,24 @@ class Hdf5Episodes(TableEpisodes):
                 continue
             return "".join(label) if isinstance(label, list) else str(label)
         return None
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array of an open file, which is opened for each access.
+
+    HDF5 keeps up to megabytes of what was read from an array for as long as the array is open.
+    """
+
+    file: Any
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    chunks: tuple[int, ...] | None
+
+    def __getitem__(self, rows: Any) -> np.ndarray:
+        values: np.ndarray = self.file[self.name][rows]
+        return values
 
 
 def _arrays(group: Any, kind: type, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:

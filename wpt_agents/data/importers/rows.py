@@ -178,11 +178,12 @@ def read_images(pieces: Pieces, convert: Callable[[np.ndarray], np.ndarray]) -> 
 
     :param convert: n images -> (n, S, S, 3) uint8
     """
-    parts = [
-        convert(np.asarray(array[at : min(at + CHUNK, stop)]))
-        for array, start, stop in pieces
-        for at in range(start, stop, CHUNK)
-    ]
+    parts = []
+    for array, start, stop in pieces:
+        # A compressed chunk, of HDF5 or zarr, is decompressed for each access to it.
+        rows = max(CHUNK, (getattr(array, "chunks", None) or (0,))[0])
+        for at in range(start, stop, rows):
+            parts.append(convert(np.asarray(array[at : min(at + rows, stop)])))
     if not parts:
         raise ValueError("there are no images")
     return np.concatenate(parts)

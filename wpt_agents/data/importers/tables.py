@@ -3,7 +3,7 @@
 import os
 import warnings
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ class TableEpisodes(Episodes):
         self._root = Path(path)
         self._shifted = shifted
         self._opened: tuple[Path, Table] | None = None
+        self._grouped: tuple[Path, Mapping[str, Table]] | None = None
         self._places: list[Place] = []
         self._chosen: set[str] = set()
         self._doubtful: list[bool] = []
@@ -94,6 +95,12 @@ class TableEpisodes(Episodes):
         if self._opened is None or self._opened[0] != file:
             self._opened = file, self._read(file)
         return self._opened[1]
+
+    def _groups(self, file: Path) -> Mapping[str, Table]:
+        """Return the arrays of each episode's group; those of the present file are kept."""
+        if self._grouped is None or self._grouped[0] != file:
+            self._grouped = file, by_group(self._table(file), self.action_keys)[0]
+        return self._grouped[1]
 
     def _find(self, file: Path, several: bool) -> int:
         """Add the locations of a file's episodes; return the number of those without an action."""
@@ -154,11 +161,7 @@ class TableEpisodes(Episodes):
         place = self._places[i]
         table = self._table(place.file)
         if place.group:
-            table = {
-                name[len(place.group) + 1 :]: array
-                for name, array in table.items()
-                if name.startswith(place.group + "/")
-            }
+            table = self._groups(place.file)[place.group]
         source = self._source(place)
         try:
             if place.bounds is None:

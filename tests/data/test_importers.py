@@ -883,6 +883,18 @@ def test_rlds_episodes_keep_to_the_chain_and_the_last_action_means_nothing(tmp_p
     assert len(TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", **SMALL)) == 4
 
 
+def test_an_episode_of_no_steps_is_left_out_of_rlds(tmp_path):
+    save_rlds(tmp_path / "a.tfrecord", [chain(5)])
+    nothing = example_class()()
+    for name in ("is_first", "reward", "observation/image"):  # no values of any
+        nothing.features.feature[f"steps/{name}"].int64_list.SetInParent()
+    with open(tmp_path / "a.tfrecord", "ab") as file:
+        RecordWriter(file).write(nothing.SerializeToString())
+    with pytest.warns(UserWarning, match="1 episode of a single image left out"):
+        [new] = open_episodes(tmp_path, **SMALL)
+    check_same(new, chain(5))
+
+
 @pytest.mark.parametrize("begin", [b"\x1f\x8b", b"\x78\x9c"], ids=["gzip", "zlib"])
 def test_a_record_whose_length_looks_like_a_compressed_file_is_read(tmp_path, begin):
     old = chain(5)

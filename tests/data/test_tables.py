@@ -108,6 +108,16 @@ def as_files(images, kind):
     return [np.frombuffer(stream.getvalue(), np.uint8) for stream in streams]
 
 
+def test_files_of_an_image_or_none_are_left_out(tmp_path):
+    old = chain(5)
+    for i, length in enumerate((0, 5, 1)):
+        arrays = {"action": old.action[:length], "observations/images/top": old.image[:length]}
+        save(tmp_path / f"episode_{i}.hdf5", arrays)
+    with pytest.warns(UserWarning, match="2 episodes of a single image left out"):
+        [new] = open_episodes(tmp_path, **SMALL)
+    check(new, old, 5)
+
+
 @pytest.mark.parametrize("padded", [True, False], ids=["ALOHA", "RoboMIND"])
 def test_compressed_images_of_aloha_are_decoded(tmp_path, padded):
     old = [chain(5 + i, i, action_dim=14) for i in range(2)]

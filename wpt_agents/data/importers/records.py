@@ -17,7 +17,7 @@ GZIP, ZLIB = b"\x1f\x8b", b"\x78\x9c"
 
 
 def find_records(file: Path) -> Iterator[tuple[int, int, bool]]:
-    """Yield the offset and length of each record's data, and whether the episode has one step.
+    """Yield the offset and length of each record's data, and if the episode has one step or none.
 
     :raises ValueError: if the file is truncated or compressed
     """
@@ -54,11 +54,11 @@ def _unreadable(file: Path, at: int, begin: bytes) -> ValueError:
 
 
 def _is_single(data: memoryview) -> bool:
-    """Return whether an episode has one step. Images are skipped, and damage is detected later."""
+    """Return whether an episode has one step or none. Images are skipped, damage is found later."""
     try:
         for name, feature in _features(data):
             if name == "steps/is_first":
-                return [len(_values(*field)) for field in _fields(feature)] == [1]
+                return sum(len(_values(*field)) for field in _fields(feature)) <= 1
     except (KeyError, IndexError, TypeError, ValueError):
         pass
     return False

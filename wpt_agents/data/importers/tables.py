@@ -120,8 +120,7 @@ class TableEpisodes(Episodes):
         flags = self.done_key is not None or first(ENDS, table) is not None
         alone = several or keys.image.startswith("observations/images/")
         if (alone and not flags) or rows.is_one_episode(table, keys, self.done_key):
-            self._places.append(Place(file, "", None, keys, self._shifted, task))
-            return 0
+            return self._add_whole(file, "", table, keys, task)
         cut = rows.cut(table, keys, self.done_key, self._shifted)
         for bounds in cut.bounds:
             self._places.append(Place(file, "", bounds, keys, cut.shifted, task))
@@ -139,11 +138,17 @@ class TableEpisodes(Episodes):
             except ValueError as error:
                 raise ValueError(f"{file} in {group}: {error}") from error
             self._say_camera(keys)
-            if count(table[keys.image]) < (2 if keys.next_image is None else 1):
-                left_out += 1
-            else:
-                self._places.append(Place(file, group, None, keys, self._shifted, task))
+            left_out += self._add_whole(file, group, table, keys, task)
         return left_out
+
+    def _add_whole(
+        self, file: Path, group: str, table: Table, keys: Keys, task: str | None
+    ) -> bool:
+        """Add the location of an episode; return whether it was left out, as it has no action."""
+        short = count(table[keys.image]) < (2 if keys.next_image is None else 1)
+        if not short:
+            self._places.append(Place(file, group, None, keys, self._shifted, task))
+        return short
 
     def _say_camera(self, keys: Keys) -> None:
         if keys.others and keys.image not in self._chosen:

@@ -64,7 +64,7 @@ def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
     printed = capsys.readouterr().out
     for word in ("dmc-quadruped-roll-fast", "demo", "no-rehearsal"):
         assert word in printed
-    assert "metaworld-" not in printed
+    assert "metaworld" not in printed
 
 
 def test_a_dry_run_shows_the_plan_and_writes_nothing(monkeypatch, capsys, tmp_path):
@@ -85,6 +85,23 @@ def test_from_nothing_pre_trains_where_a_preset_starts_from_a_shipped_model(
     assert "world model  metaworld-mid, which ships" in capsys.readouterr().out
     assert call(monkeypatch, "run", *words, "--from-nothing") == 0
     assert "world model  2,500 updates to make" in capsys.readouterr().out
+
+
+def test_from_nothing_changes_no_label_where_a_preset_pre_trains_anyway(monkeypatch, tmp_path):
+    planned = []
+    monkeypatch.setattr(
+        "wpt_agents.zoo.run.dispatch.preview", lambda runs, *_: planned.extend(runs)
+    )
+    words = ["--tasks", "walker-run", "--preset", "debug", "--out", tmp_path]
+    assert call(monkeypatch, "run", *words, "--from-nothing", "--dry-run") == 0
+    assert str(planned[0].variant) == "debug"
+
+
+def test_pretrain_refuses_a_preset_that_starts_from_a_shipped_model(monkeypatch, capsys, tmp_path):
+    words = ["--suite", "metaworld", "--preset", "demo", "--out", tmp_path]
+    assert call(monkeypatch, "pretrain", *words) == 2
+    assert "--set pretrain.model= to pre-train another" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
@@ -113,7 +130,8 @@ def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_
 
 
 def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
-    sections = [f"{t}.{k}={json.dumps(v)}" for t in SECTIONS for k, v in SECTIONS[t].items()]
+    own = ("env", "collect", "pretrain", "learn", "evaluate", "wpt")  # not of other agents
+    sections = [f"{t}.{k}={json.dumps(v)}" for t in own for k, v in SECTIONS[t].items()]
     words = ["run", "--preset", "debug", "--tasks", "dot", "--out", tmp_path, "--workers", "1"]
     assert call(monkeypatch, *words, "--frames", "50", "--set", *sections) == 0
     folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"

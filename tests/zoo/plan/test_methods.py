@@ -10,8 +10,8 @@ from test_resume import killed_at
 
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.zoo.plan import methods
+from wpt_agents.zoo.plan.effects import check_changes
 from wpt_agents.zoo.plan.methods import Method, defaults
-from wpt_agents.zoo.plan.runs import check_changes
 from wpt_agents.zoo.result import Change
 from wpt_agents.zoo.run import runner
 from wpt_agents.zoo.run.runner import run

@@ -326,6 +326,15 @@ def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_p
         ("scratch", ["guidance=linear(1,0,9)"], "--method scratch means guidance=0.0"),
         ("scratch", ["plus.kickstart=5"], "--method scratch means kickstart=0.0"),
         ("uds", ["rlpd.label=true"], "--method uds means label=zero"),
+        (
+            "wpt",
+            ["plus.kickstart=5"],
+            "plus is of --method wpt+ and scratch; write --set kickstart",
+        ),
+        ("drq-v2", ["plus.kickstart=5"], "plus is of --method wpt+ and scratch; leave it out"),
+        ("wpt", ["sac.gamma=0.5"], "the section sac is not of --method wpt"),
+        ("wpt", ["evaluate.keep_best=true"], "no evaluations are made"),
+        ("wpt", ["evaluate.during_episodes=2"], "add --set evaluate.every=FRAMES"),
     ],
 )
 def test_what_a_run_would_stumble_over_or_overrule_is_refused_beforehand(
@@ -347,7 +356,7 @@ def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_pat
 def test_a_setting_overrules_the_additions_of_the_preset(key, method, tmp_path):
     settings = ["plus.kickstart=7", f"{key}=5"]
     [one] = plan("metaworld", ["drawer-close"], "mid", tmp_path, method, settings)
-    assert one.keywords["kickstart"] == 5
+    assert one.keywords["kickstart"] == 5 and str(one.variant) == "mid kickstart=5"
     assert one.keywords.get("actor_delay") == (300 if method == "wpt+" else None)
 
 
@@ -361,3 +370,49 @@ def test_an_empty_value_trains_the_shipped_model_again():
     shipped = load_preset("metaworld", "mid").pretrain
     assert shipped.model == "metaworld-mid"
     assert load_preset("metaworld", "mid", ["pretrain.model="]).pretrain.model == ""
+
+
+@pytest.mark.parametrize("setting", ["pretrain.steps=5", "size=tiny", "max_action_dim=6"])
+def test_settings_that_a_shipped_model_makes_void_are_refused_with_a_remedy_that_works(
+    setting, tmp_path
+):
+    where = "metaworld", ["drawer-close"], "mid", tmp_path
+    with pytest.raises(
+        ValueError, match=r"shipped model metaworld-mid; add --set pretrain\.model= "
+    ):
+        plan(*where, settings=[setting])
+    assert plan(*where, settings=[setting, "pretrain.model="])
+    assert plan(*where, settings=["size=mid"])  # as the preset's
+
+
+def test_a_setting_that_affects_one_of_the_methods_is_allowed(tmp_path):
+    settings = ["sac.gamma=0.5", "plus.actor_delay=9"]
+    arguments = "dmc", ["walker-run"], "debug", "1", ["wpt", "wpt+", "sac"], settings
+    assert len(make_plan(*arguments, tmp_path, 1, "cpu")) == 3
+
+
+def test_settings_of_the_presets_data_are_refused_with_data_of_ones_own(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "own") as dataset:
+        dataset.append(recorded(actions=6))
+    where = "dmc", ["walker-run"], "debug", tmp_path
+    with pytest.raises(ValueError, match="takes the place of the preset's data"):
+        plan(*where, settings=["collect.episodes=5"], data=tmp_path / "own")
+    assert plan(*where, settings=["collect.episodes=5"])
+
+
+def test_data_too_wide_for_a_shipped_model_are_refused_with_a_remedy_that_works(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "own") as dataset:
+        dataset.append(recorded(actions=7))
+    where = "metaworld", ["reach"], "mid", tmp_path, "pretrain-only"
+    with pytest.raises(ValueError, match=r"--set max_action_dim=7 pretrain\.model=$"):
+        plan(*where, data=tmp_path / "own")
+    settings = ["max_action_dim=7", "pretrain.model="]
+    assert plan(*where, settings, data=tmp_path / "own")
+
+
+def test_only_wpt_starts_from_a_shipped_model(tmp_path):
+    where = "metaworld", ["drawer-close"], "mid", tmp_path
+    [run] = plan(*where)
+    assert run.shared.shipped == "metaworld-mid"
+    [run] = plan(*where, "r3m", ["pretrain.steps=5"])
+    assert run.shared.shipped == "" and run.preset.pretrain.steps == 5

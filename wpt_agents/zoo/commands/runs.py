@@ -114,7 +114,7 @@ def list_tasks(
             paper = "yes" if row.in_paper else "no"
             table.add_row(short_name(row), row.embodiment, *numbers, row.metric, paper)
     console.print(table)
-    for name in suite_names():
+    for name in [suite] if suite else suite_names():
         console.print(f"presets of {name}: {', '.join(preset_names(name))}")
     console.print(f"methods: {', '.join(METHODS)}")
     console.print(f"sequences: {', '.join(sequence_names())}")
@@ -145,13 +145,19 @@ def pretrain_model(
     """
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device, choose_threads
+    from wpt_agents.zoo.plan.effects import check_effects, from_shipped
+    from wpt_agents.zoo.plan.methods import METHODS
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.shared import Shared
+    from wpt_agents.zoo.result import Change
     from wpt_agents.zoo.run.shared import collect_data, pretrain
     from wpt_agents.zoo.terminal import console
 
     check_device(device)
     chosen = load_preset(suite, preset, settings)
+    if chosen.pretrain.model:
+        raise ValueError(f"Nothing to pre-train: {from_shipped(chosen)}")
+    check_effects([Change.parse(text).short for text in settings], METHODS, chosen, data)
     choose_threads(chosen.size)
     shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
     with joined(local_device(device)) as world:
@@ -199,6 +205,7 @@ def run_benchmark(
     Fig. 4: `python -m wpt_agents.zoo run --sequence ant --method wpt packnet --preset tiny`
     """
     from wpt_agents.training.distributed import started_by_torchrun
+    from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import make_sequences
     from wpt_agents.zoo.run.dispatch import do_plan, do_sequences, preview
@@ -208,7 +215,8 @@ def run_benchmark(
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: pre-train with it, then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
-    changes += ["pretrain.model="] if from_nothing else []
+    if from_nothing and load_preset(suite, preset).pretrain.model:
+        changes.append("pretrain.model=")
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")

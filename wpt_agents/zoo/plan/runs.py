@@ -19,8 +19,9 @@ from wpt_agents.files.names import unknown_name
 from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
-from wpt_agents.zoo.plan.methods import Method, defaults, find_method, sections
-from wpt_agents.zoo.plan.presets import Preset, load_preset, wpt_keywords
+from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shape
+from wpt_agents.zoo.plan.methods import Method, defaults, find_method
+from wpt_agents.zoo.plan.presets import Preset, load_preset
 from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
@@ -200,10 +201,12 @@ def make_plan(
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
     check_preset(resolved)
-    changes = tuple({c.key: c for c in (Change.parse(s).short for s in settings)}.values())
+    changes = effective_changes(settings)
     names = list(dict.fromkeys(methods))
     for name in names:
         check_changes(name, changes)
+    check_effects(changes, names, resolved, data)
+    check_shape(resolved, load_preset(suite, preset, (), sections), names)
     runs = [
         Run(
             task=row,
@@ -228,6 +231,18 @@ def make_plan(
     return runs
 
 
+def effective_changes(settings: Sequence[str]) -> tuple[Change, ...]:
+    """Return the settings that no later one overrules.
+
+    A keyword of WPT also overrules the same keyword of the section `plus` before it.
+    """
+    changes: dict[str, Change] = {}
+    for change in (Change.parse(text).short for text in settings):
+        changes.pop(f"plus.{change.key}", None)
+        changes[change.key] = change
+    return tuple(changes.values())
+
+
 def action_widths(suite: str, preset: Preset, data: Path | None) -> set[int]:
     """Return the numbers of actions that occur in the data."""
     if data is not None:
@@ -244,23 +259,6 @@ def check_preset(preset: Preset) -> None:
     ):
         if value not in known:
             raise unknown_name(name, value, known)
-
-
-def check_changes(name: str, changes: Sequence[Change]) -> None:
-    """Raise an error for a setting that the method overrides or its agent does not accept."""
-    method = find_method(name)
-    for change in changes:
-        section, _, keyword = change.key.rpartition(".")
-        if section in ("", "plus", *sections(method.agent)) and keyword in method.keywords:
-            raise ValueError(
-                f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "
-                "would have no effect: leave it out, or take another --method"
-            )
-        if method.shared is not None and change.key in wpt_keywords().keys() - set(method.shared):
-            raise ValueError(
-                f"--method {name} takes only {', '.join(method.shared) or 'none'} of WPT's "
-                f"keywords, so --set {change} would have no effect: leave it out"
-            )
 
 
 def check_width(run: Run, widths: Collection[int]) -> None:
@@ -280,7 +278,8 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     widest = max(needed, *widths) if run.algorithm.needs_data else needed
     if limit is not None and widest > limit:
         whose = f"{short_name(run.task)} has" if needed == widest else "The data have"
+        starts = run.algorithm.pretrained and run.shared.shipped
         raise ValueError(
             f"{whose} {widest} actions, the preset's max_action_dim is {limit}: "
-            f"--set max_action_dim={widest}"
+            f"--set max_action_dim={widest}{' pretrain.model=' if starts else ''}"
         )

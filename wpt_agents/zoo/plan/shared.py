@@ -51,6 +51,11 @@ class Shared:
     agent: type[BaseAlgorithm] = WPT
 
     @property
+    def log(self) -> Path:
+        """The file with the output of the stages if an engine executes them."""
+        return self.cache / "log.txt"
+
+    @property
     def env(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make`."""
         return asdict(self.preset.env)

@@ -1,0 +1,98 @@
+"""Refuse settings that would have no effect, whose runs would be labelled with them in vain."""
+
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.zoo.plan.methods import AGENTS, METHODS, find_method, sections
+from wpt_agents.zoo.plan.presets import Preset, wpt_keywords
+from wpt_agents.zoo.result import Change
+
+
+def check_effects(
+    changes: Iterable[Change], methods: Collection[str], preset: Preset, data: Path | None
+) -> None:
+    """Raise an error for a setting that affects none of the runs.
+
+    :param changes: the user's
+    :param preset: with the changes
+    :param data: the user's own dataset, None for the preset's
+    """
+    for change in changes:
+        if reason := why_useless(change, methods, preset, data):
+            raise ValueError(f"--set {change} would have no effect: {reason}")
+
+
+def check_changes(name: str, changes: Sequence[Change]) -> None:
+    """Raise an error for a setting that the method overrides or its agent does not accept."""
+    method = find_method(name)
+    for change in changes:
+        section, _, keyword = change.key.rpartition(".")
+        if section in ("", "plus", *sections(method.agent)) and keyword in method.keywords:
+            raise ValueError(
+                f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "
+                "would have no effect: leave it out, or take another --method"
+            )
+        if method.shared is not None and change.key in wpt_keywords().keys() - set(method.shared):
+            raise ValueError(
+                f"--method {name} takes only {', '.join(method.shared) or 'none'} of WPT's "
+                f"keywords, so --set {change} would have no effect: leave it out"
+            )
+
+
+def why_useless(
+    change: Change, methods: Collection[str], preset: Preset, data: Path | None
+) -> str | None:
+    """Return why a setting affects none of the runs, with the remedy; None if it affects one.
+
+    Settings of data and pre-training are allowed for methods without these stages, because runs
+    are compared with those of the same settings.
+    """
+    section, _, keyword = change.key.rpartition(".")
+    chosen = [METHODS[name] for name in methods]
+    if section in AGENTS and not any(section in sections(one.agent) for one in chosen):
+        return f"the section {section} is not of --method {' '.join(methods)}; leave it out"
+    if section == "plus" and not any(one.plus for one in chosen):
+        with_plus = " and ".join(name for name, one in METHODS.items() if one.plus)
+        of_wpt = all(one.agent is WPT and keyword not in one.keywords for one in chosen)
+        instead = f"write --set {keyword}={change.value}" if of_wpt else "leave it out"
+        return f"the section plus is of --method {with_plus}; {instead}"
+    if section == "collect" and data is not None:
+        return f"--data {data} takes the place of the preset's data; leave one of them out"
+    if section == "pretrain" and keyword != "model" and only_shipped(preset, methods):
+        return from_shipped(preset)
+    evaluated = keyword == "during_episodes" or (
+        keyword == "keep_best" and preset.evaluate.keep_best
+    )
+    if section == "evaluate" and evaluated and not preset.evaluate.every:
+        return "no evaluations are made during fine-tuning; add --set evaluate.every=FRAMES"
+    return None
+
+
+def only_shipped(preset: Preset, methods: Collection[str]) -> bool:
+    """Return whether no pre-training is done, because a shipped model takes its place.
+
+    These models are WPT's; other agents that need one are pre-trained.
+    """
+    pretrained = [METHODS[name] for name in methods if METHODS[name].pretrained]
+    return bool(preset.pretrain.model) and all(one.agent is WPT for one in pretrained)
+
+
+def from_shipped(preset: Preset) -> str:
+    """Return the reason and the remedy if the preset starts from a shipped model."""
+    return (
+        f"the preset starts from the shipped model {preset.pretrain.model}; add --set "
+        "pretrain.model= to pre-train another"
+    )
+
+
+def check_shape(preset: Preset, unchanged: Preset, methods: Collection[str]) -> None:
+    """Raise an error for widths that the preset's shipped model does not have.
+
+    :param unchanged: the preset without the user's changes
+    """
+    starts = any(METHODS[name].pretrained and METHODS[name].agent is WPT for name in methods)
+    for name in WPT.shape_keywords if starts and preset.pretrain.model else ():
+        value = preset.wpt.get(name)
+        if value != unchanged.wpt.get(name):
+            raise ValueError(f"--set {name}={value} is not possible: {from_shipped(preset)}")

@@ -180,6 +180,21 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
     assert ran.exit_code == 0 and "bench data is left out: it needs h5py" in ran.stderr
 
 
+@pytest.mark.parametrize(
+    ("case", "option"),
+    [
+        ("replay", ["--updates", "5"]),
+        ("model", ["--behaviour", "icm"]),
+        ("prediction", ["--steps", "9"]),
+        ("work", ["--threads", "2"]),
+        ("policy", ["--precision", "bf16"]),
+    ],
+)
+def test_an_option_without_effect_on_the_case_is_refused(case, option):
+    ran = CliRunner().invoke(app, ["bench", case, "--quick", *option])
+    assert f"{option[0]} has no effect on bench {case}" in str(ran.exception)
+
+
 def test_a_table_shortens_nothing(monkeypatch, capsys):
     monkeypatch.setattr(Console, "size", ConsoleDimensions(60, 25))
     task = "metaworld-button-press-topdown-wall"

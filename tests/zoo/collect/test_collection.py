@@ -254,6 +254,17 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"behaviour": "policy", "policy": "no.zip"}, r"No policy no\.zip"),
         ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),
+        ({"sigmas": [0.5]}, r"sigmas \(--sigma\) have no effect on the behaviour 'noise'"),
+        ({"behaviour": "icm", "sigmas": [0.5]}, "take scripted or policy"),
+        ({"settings": {"gamma": 0.9}}, r"settings \(--set\) have no effect on .* 'noise'"),
+        (
+            {
+                "behaviour": "scripted",
+                "tasks": ["wpt/metaworld-reach-v0"],
+                "settings": {"steps": 9},
+            },
+            "explore-state",
+        ),
     ],
 )
 def test_what_cannot_be_collected_is_refused_before_anything_is_written(

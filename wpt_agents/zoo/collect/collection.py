@@ -41,7 +41,9 @@ from wpt_agents.zoo.collect.workers import worker_pool
 from wpt_agents.zoo.plan.presets import EXPLORATION_KEYWORDS
 from wpt_agents.zoo.terminal import progress
 
-BEHAVIOURS = ("random", "noise", "scripted", "policy", STATE_CURIOSITY, *EXPLORERS)
+NOISY = ("scripted", "policy")  # behaviours with noise of `sigmas`
+CURIOUS = (STATE_CURIOSITY, *EXPLORERS)  # behaviours with `settings`
+BEHAVIOURS = ("random", "noise", *NOISY, *CURIOUS)
 EPISODES_A_JOB = 4
 Work = TypeVar("Work")
 Result = TypeVar("Result")
@@ -88,6 +90,7 @@ def collect(
         of "explore-state"
     """
     _check(tasks, episodes, behaviour, policy)
+    _check_options(behaviour, sigmas, settings or {})
     _check_settings(behaviour, settings or {})
     recipe = Recipe(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
@@ -213,6 +216,20 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
         )
     if policy is not None:
         load_policy(policy)  # raises an error if the policy is invalid
+
+
+def _check_options(behaviour: str, sigmas: Sequence[float], settings: Mapping[str, Any]) -> None:
+    """Raise an error for options that have no effect on the behaviour."""
+    if tuple(sigmas) != SIGMAS and behaviour not in NOISY:
+        raise ValueError(
+            f"sigmas (--sigma) have no effect on the behaviour {behaviour!r}: leave them out, or "
+            f"take {' or '.join(NOISY)}"
+        )
+    if settings and behaviour not in CURIOUS:
+        raise ValueError(
+            f"settings (--set) have no effect on the behaviour {behaviour!r}: leave them out, or "
+            f"take {', '.join(CURIOUS)}"
+        )
 
 
 def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:

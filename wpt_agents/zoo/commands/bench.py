@@ -125,6 +125,8 @@ def bench(
     for name in everywhere if case == Case.all else [case]:
         try:
             module = importlib.import_module(f"wpt_agents.zoo.bench.{'peers' if peer else name}")
+            if case != Case.all:
+                _refuse_unused(case, module, options)
             measured = _show(str(name), _rows(module, options), as_json)
             if plot:
                 module.plot(measured, plot)
@@ -134,6 +136,24 @@ def bench(
                     f"bench {name} needs {error.name}, which is not installed"
                 ) from error
             typer.echo(f"bench {name} is left out: it needs {error.name}.", err=True)
+
+
+# Options of some cases only: their keywords of `rows`, their names, and their defaults.
+PARTIAL = {
+    "threads": ("--threads", 1),
+    "precision": ("--precision", "fp32"),
+    "updates": ("--updates", None),
+    "behaviours": ("--behaviour", None),
+    "steps": ("--steps", None),
+}
+
+
+def _refuse_unused(case: Case, module: ModuleType, options: dict[str, Any]) -> None:
+    """Raise an error for an option that has no effect on the case."""
+    taken = inspect.signature(module.rows).parameters
+    for key, (option, default) in PARTIAL.items():
+        if key not in taken and options[key] not in (default, []):
+            raise ValueError(f"{option} has no effect on bench {case}: leave it out")
 
 
 def _rows(module: ModuleType, options: dict[str, Any]) -> Iterator[dict]:

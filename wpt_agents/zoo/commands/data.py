@@ -81,7 +81,7 @@ RenderingOption = Annotated[
         "shadows. Use the same in the task."
     ),
 ]
-Seed = Annotated[int, typer.Option(help="The seed of the episodes.")]
+Seed = Annotated[int, typer.Option(min=0, help="The seed of the episodes.")]
 
 
 def collect_data(

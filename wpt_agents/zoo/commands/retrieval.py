@@ -75,7 +75,7 @@ def share_retrieval(
     images: Annotated[
         list[int], typer.Option(min=1, help="The number of first images of the task to compare.")
     ] = [1, 5, 10, 20, 40],  # noqa: B006
-    seed: Annotated[int, typer.Option(help="The seed of the first episode.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the first episode.")] = 0,
 ) -> None:
     """Print the share of retrieved trajectories that are of the right task.
 

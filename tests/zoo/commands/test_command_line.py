@@ -117,4 +117,10 @@ def test_a_group_without_a_command_shows_its_help(monkeypatch, capsys):
 def test_ctrl_c_ends_in_one_sentence(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("wpt_agents.zoo.judge.trained.find_trained", fail(KeyboardInterrupt()))
     assert call(monkeypatch, "eval", tmp_path) == 130
-    assert capsys.readouterr().err.count("Interrupted. The same command continues") == 1
+    assert capsys.readouterr().err.count("Interrupted. The same command continues from") == 1
+
+
+def test_ctrl_c_of_a_forced_run_says_that_force_would_begin_again(monkeypatch, capsys):
+    monkeypatch.setattr("wpt_agents.zoo.plan.runs.make_plan", fail(KeyboardInterrupt()))
+    assert call(monkeypatch, "run", "--force") == 130
+    assert capsys.readouterr().err == "Interrupted. The same command continues without --force.\n"

@@ -90,7 +90,8 @@ def main() -> None:
         if message:  # empty if typer has printed the help of a group such as `data`
             typer.secho(f"Error: {message}", fg="red", err=True)
     if code == INTERRUPTED:
-        typer.echo("Interrupted. The same command continues from the finished stages.", err=True)
+        again = "without --force" if "--force" in words else "from the finished stages"
+        typer.echo(f"Interrupted. The same command continues {again}.", err=True)
     sys.exit(code or 0)
 
 

@@ -112,6 +112,13 @@ def test_a_row_counts_horizons_from_1_and_compares_within_trajectories():
     assert row["minus copying"] == -3 and row["95 % "] == "-3.0 to -3.0"
 
 
+def test_a_single_trajectory_has_no_interval():
+    row = prediction.row("arm", "x", np.ones((1, 41)), np.ones((1, 41)))
+    assert (row["episodes"], row["95 %"], row["95 % "]) == (1, "-", "-")
+    mean, low, high = prediction.with_interval(np.ones((1, 41)))
+    assert mean.tolist() == [1.0] * 41 and np.isnan([low, high]).all()
+
+
 def test_the_typical_window_moves_neither_most_nor_least():
     parts = [prediction.windows(clock(44, speed), 1, 1) for speed in (5, 1, 3)]
     assert prediction.typical(parts) is parts[2]

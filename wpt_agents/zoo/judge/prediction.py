@@ -158,7 +158,13 @@ def errors_by_horizon(predict: Predict, tests: Sequence[Batch]) -> np.ndarray:
 
 
 def with_interval(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(trajectories, ...) -> the mean (...) and its 95 % bootstrap interval over trajectories."""
+    """(trajectories, ...) -> the mean (...) and its 95 % bootstrap interval over trajectories.
+
+    The interval of a single trajectory is NaN.
+    """
+    if len(errors) < 2:
+        unknown = np.full(errors.shape[1:], np.nan)
+        return errors.mean(0), unknown, unknown
     low, high = bootstrap(lambda strata: strata[0].mean(1), [errors], draws=2000)
     return errors.mean(0), low, high
 
@@ -174,10 +180,14 @@ def row(robot: str, name: str, errors: np.ndarray, copied: np.ndarray) -> dict[s
         "episodes": len(errors),
         **{f"+{h}": round(float(errors[:, h].mean()), 1) for h in HORIZONS_SHOWN},
         f"mean of 1 to {HORIZON}": round(float(mean), 1),
-        "95 %": f"{low:.1f} to {high:.1f}",
+        "95 %": _span(low, high),
         "minus copying": round(float(less), 1),
-        "95 % ": f"{least:.1f} to {most:.1f}",
+        "95 % ": _span(least, most),
     }
+
+
+def _span(low: np.ndarray, high: np.ndarray) -> str:
+    return "-" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
 
 
 def one_by_one(batch: Batch) -> Iterator[Batch]:

@@ -65,6 +65,11 @@ class Task:
         """The id for `gymnasium.make`."""
         return f"wpt/{self.suite}-{self.name}-v0"
 
+    @property
+    def action_repeat(self) -> int:
+        """The default number of control steps in a step of `gymnasium.make`."""
+        return 1 if self.suite == "robotics" else 2
+
 
 def _rows() -> list[Task]:
     rows = []

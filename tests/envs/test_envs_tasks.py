@@ -22,6 +22,13 @@ assert not [name for name in sys.modules if name.split(".")[0] == "wpt_agents"]
 """
 
 
+@pytest.mark.parametrize("module", [dmc, metaworld, robotics])
+def test_the_table_knows_how_often_an_action_is_repeated_by_default(module):
+    default = inspect.signature(module.make).parameters["action_repeat"].default
+    rows = tasks.suite(module.__name__.split(".")[-1], paper_only=False)
+    assert {task.action_repeat for task in rows} == {default}
+
+
 def test_the_paper_has_22_dmcontrol_and_50_metaworld_tasks():
     assert len(tasks.suite("dmc")) == 22
     assert len(tasks.suite("metaworld")) == 50

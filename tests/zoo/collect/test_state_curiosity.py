@@ -7,6 +7,7 @@ from stable_baselines3 import SAC
 from zoo_command import call
 
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.collect import state_curiosity
 from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.state_curiosity import Novelty, explore_states, state_policy
 
@@ -35,6 +36,27 @@ def test_the_running_mean_and_variance_are_those_of_all_states():
         novelty._see(part)
     torch.testing.assert_close(novelty.mean, states.mean(0))
     torch.testing.assert_close(novelty.var, states.var(0, correction=0))
+
+
+@pytest.mark.parametrize(
+    ("task", "env", "repeat"),
+    [(TASK, ENV, 2), (TASK, {"action_repeat": 4}, 4), ("wpt/robotics-fetch-reach-v0", ENV, 1)],
+)
+def test_actions_are_repeated_as_often_as_where_the_data_are_played(task, env, repeat, monkeypatch):
+    made = []
+
+    class Seen(Exception):
+        pass
+
+    def note(_, times):
+        made.append(times)
+        raise Seen
+
+    monkeypatch.setattr(state_curiosity.gym, "make", lambda *_, **__: None)
+    monkeypatch.setattr(state_curiosity, "StateTask", note)
+    with pytest.raises(Seen):
+        explore_states(task, env)
+    assert made == [repeat]
 
 
 def test_a_stage_acts_as_soft_actor_critic_does():

@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+import wpt_envs
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -157,7 +158,7 @@ def explore_states(
     :return: the policies' weights, oldest first, for `state_policy`
     """
     keywords = dict(env or {})
-    repeat = int(keywords.get("action_repeat", 2))
+    repeat = int(keywords.get("action_repeat", wpt_envs.TASKS[task].action_repeat))
     with closing(StateTask(gym.make(task, **keywords), repeat)) as states:
         torch.manual_seed(seed)
         model = SAC(

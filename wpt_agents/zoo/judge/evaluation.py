@@ -85,7 +85,7 @@ def make_vec_env(
 def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
     """Return the number of `env.step` calls in an episode of the task, None if unknown."""
     row = wpt_envs.TASKS.get(task)
-    return row.frames // env.get("action_repeat", 2) if row else None
+    return row.frames // env.get("action_repeat", row.action_repeat) if row else None
 
 
 def evaluate(

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from debug_agent import agent, recorded
+from dot_runs import DOT, dot  # noqa: F401  (dot registers the task for each test)
 from PIL import Image
 from toy_env import DotEnv
 from wpt_envs.tasks import find
@@ -11,6 +12,8 @@ from zoo_command import call
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.zoo.judge.evaluation import make_vec_env
+from wpt_agents.zoo.judge.retrieved import own_task_shares
 from wpt_agents.zoo.pictures import datasets, retrieval
 
 
@@ -89,6 +92,22 @@ def test_a_task_is_searched_for_by_its_first_image():
     assert (query.embodiment, query.action_dim) == ("sawyer", 4)
 
 
+@pytest.mark.parametrize("images", [1, 3])
+def test_the_sheet_of_a_run_shows_what_the_run_retrieves(dataset, images, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(retrieval, "retrieval_sheet", lambda _, __, rows: shown.extend(rows))
+    venv = make_vec_env(DOT.id, {"rendering": "fast"}, 5)
+    settings = {"retrieval_images": images, "num_retrieve": 3, "bc_steps": 1}
+    model = agent(venv, dataset=dataset, embodiment="dot", **settings)
+    retrieval.sheet_of_run(tmp_path / "a.png", model, DOT, {"rendering": "fast"}, 5)
+    model._last_obs = venv.reset()
+    model._last_episode_starts = np.ones(1, bool)
+    model.retrieve()
+    own, every = shown
+    assert own.indices.tolist() == model.progress.retrieved_ids
+    assert len(every.indices) == 5 and (f"for {images}" in own.query.name) == (images > 1)
+
+
 def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, monkeypatch, capsys):
     agent(DotEnv()).save(tmp_path / "model.zip")
     words = [dataset.path, "--model", tmp_path / "model.zip", "--out", tmp_path / "found.png"]
@@ -118,6 +137,15 @@ def test_the_share_of_the_own_task_counts_what_the_index_finds(tmp_path, monkeyp
     words += ["--number", 1, "--seed", 2]
     assert call(monkeypatch, "retrieve", "share", tmp_path / "data", *words) == 0
     assert capsys.readouterr().out.split("\n")[1].split() == ["reach", "1.00", "1.00"]
+
+
+@pytest.mark.parametrize("name", ["wpt/dmc-dot-v0", "dmc-dot", "dot"])
+def test_the_share_of_the_own_task_knows_its_names_in_other_data(name, tmp_path):
+    with TrajectoryDataset.create(tmp_path / "data") as data:
+        data.append(recorded(task=name))
+    model = agent(DotEnv(), dataset=data)
+    [(_, [share])] = own_task_shares(model, [DOT], [1], 1, {"rendering": "fast"})
+    assert share == 1.0
 
 
 def test_datasets_are_checked_and_joined_from_a_terminal(tmp_path, monkeypatch, capsys):

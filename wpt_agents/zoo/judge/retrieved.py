@@ -9,6 +9,7 @@ import numpy as np
 from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.zoo.tasks import name_in_data
 
 
 def own_task_shares(
@@ -31,8 +32,9 @@ def own_task_shares(
     of = np.array(model.dataset.tasks)
     index = model.build_index()
     for task in tasks:
+        name = name_in_data(task, model.dataset.tasks)
         with closing(gym.make(task.id, **env)) as made:
             first = np.stack([made.reset(seed=seed + i)[0] for i in range(max(images))])
         features = model.policy.embed(first)
         nearest = (index.search(features[:count], number)[0] for count in images)
-        yield task.name, [float((of[numbers] == task.id).mean()) for numbers in nearest]
+        yield task.name, [float((of[numbers] == (name or task.id)).mean()) for numbers in nearest]

@@ -12,6 +12,7 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.zoo.judge.evaluation import make_vec_env
 from wpt_agents.zoo.pictures.runs import AGENT, CLONE, INK, plt
 from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, kind
 
@@ -24,6 +25,7 @@ class Query(NamedTuple):
     embodiment: str | None
     action_dim: int
     number: int | None = None  # its index, if it is from the dataset
+    images: np.ndarray | None = None  # (n, 64, 64, 3), if several first images are searched for
 
 
 class Found(NamedTuple):
@@ -53,6 +55,15 @@ def query_at(task: Task, env: Mapping[str, Any], seed: int = 0) -> Query:
     return Query(f"first image of\n{cut(task.name, 18)}", image, task.embodiment, task.action_dim)
 
 
+def first_images(task: Task, env: Mapping[str, Any], seed: int, number: int) -> np.ndarray:
+    """Return the first images of a task's first episodes, (number, 64, 64, 3).
+
+    :param seed: of the environment, as in fine-tuning
+    """
+    with closing(make_vec_env(task.id, env, seed)) as made:
+        return np.concatenate([np.asarray(made.reset()) for _ in range(number)])
+
+
 def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
     """Return the nearest by Eq. (5), without the query's own trajectory.
 
@@ -61,7 +72,7 @@ def search(model: WPT, query: Query, number: int, own_robot: bool) -> Found:
     assert model.dataset is not None
     robot = query.embodiment if query.embodiment in model.dataset.embodiments else None
     known = (robot, query.action_dim) if own_robot else (None, None)
-    feature = model.policy.embed(query.image[None])[0]
+    feature = model.policy.embed(query.image[None] if query.images is None else query.images)
     indices, distances = model.build_index().search(feature, number + 1, *known)
     others = indices != (-1 if query.number is None else query.number)
     return Found(query, indices[others][:number], distances[others][:number])
@@ -93,12 +104,17 @@ def retrieval_sheet(
 
 
 def sheet_of_run(path: Path, model: WPT, task: Task, env: Mapping[str, Any], seed: int) -> None:
-    """Draw the trajectories that a run retrieves, and below them the nearest of all robots."""
+    """Draw the trajectories that a run retrieves, and below them the nearest of all robots.
+
+    With `retrieval_images`, the first row shows those that are nearest to one of these images.
+    """
     assert model.dataset is not None
+    name = cut(task.name, 18)
     query = query_at(task, env, seed)
-    rows = {"retrieved for\n": True, "nearest of all\n": False}
-    results = [
-        search(model, query._replace(name=f"{name}{cut(task.name, 18)}"), COLUMNS, own_robot)
-        for name, own_robot in rows.items()
-    ]
+    one = query._replace(name=f"retrieved for\n{name}")
+    if (number := model.retrieval_images) > 1:
+        images = first_images(task, env, seed, number)
+        one = one._replace(name=f"retrieved for {number}\nimages of {name}", images=images)
+    every = query._replace(name=f"nearest of all\n{name}")
+    results = [search(model, one, COLUMNS, True), search(model, every, COLUMNS, False)]
     retrieval_sheet(path, model.dataset, results)

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import promises
 from wpt_agents.zoo.judge.trained import Origin, find_trained
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.hub import card, pull, push
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run.runner import run
@@ -139,6 +141,23 @@ def test_what_cannot_be_played_is_told(words, message, tmp_path, monkeypatch, ca
     (tmp_path / "damaged" / "config.yaml").write_text("task: [")
     assert call(monkeypatch, *words) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_task_of_a_sequence_is_played_as_the_sequence_was(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "ant_0" / "dmc-quadruped-walk"
+    folder.mkdir(parents=True)
+    (folder / "model.zip").touch()
+    tasks = [f"wpt/dmc-quadruped-{name}-v0" for name in ("stand", "walk")]
+    env = {"action_repeat": 4, "rendering": "fast"}
+    config = {"task": "ant", "tasks": tasks, "env": env, "method": "packnet"}
+    (tmp_path / "ant_0" / "config.yaml").write_text(yaml.safe_dump(config))
+    trained = find_trained(folder)
+    assert (trained.task, trained.env, trained.method) == (tasks[1], env, METHODS["packnet"])
+    assert find_trained(folder / "model.zip") == trained
+    monkeypatch.chdir(folder)
+    assert find_trained(Path("model.zip")).task == tasks[1]
+    assert call(monkeypatch, "eval", tmp_path / "ant_0") == 2
+    assert "name one in it: dmc-quadruped-walk" in capsys.readouterr().err
 
 
 def test_the_hub_is_asked_for_only_when_needed_and_told_if_missing(tmp_path, monkeypatch, capsys):

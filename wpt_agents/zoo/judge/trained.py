@@ -1,7 +1,7 @@
 """A trained model: find it with its task, evaluate it and film it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -119,6 +119,8 @@ def best_model(folder: Path) -> Path:
     for name in ("best_model.zip", "model.zip"):
         if (folder / name).exists():
             return folder / name
+    if names := sorted(path.parent.name for path in folder.glob("*/model.zip")):
+        raise FileNotFoundError(f"{folder} holds no model.zip; name one in it: {', '.join(names)}")
     raise FileNotFoundError(f"{folder} holds no model.zip: the run is not finished")
 
 
@@ -132,10 +134,22 @@ class Origin:
 
 
 def read_origin(folder: Path) -> Origin | None:
-    """Read `config.yaml` of a run folder; return None if there is none."""
+    """Read the origin of the models in a run folder, or in the folder of a task of a sequence.
+
+    :return: None if there is no `config.yaml`
+    """
     path = folder / "config.yaml"
-    if not path.exists():
-        return None
+    if path.exists():
+        return _read_config(path)
+    folder = folder.absolute()
+    task = f"wpt/{folder.name}-v0"
+    sequence = folder.parent / "config.yaml"
+    return (
+        replace(_read_config(sequence), task=task) if task in TASKS and sequence.exists() else None
+    )
+
+
+def _read_config(path: Path) -> Origin:
     try:
         config = SimpleNamespace(**yaml.safe_load(path.read_text(encoding="utf-8")))
         env = EnvSettings.of("env", config.env)

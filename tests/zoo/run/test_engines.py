@@ -75,6 +75,16 @@ def test_local_does_not_try_again_what_failed_by_itself(tmp_path):
     assert times_done(one) == 1
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_data_that_cannot_be_made_are_told_with_their_own_reason_and_the_log(tmp_path):
+    one = job(tmp_path)  # whose task is unknown to other processes
+    one.folder.mkdir(parents=True)
+    (one.folder / "config.yaml").write_text(yaml.safe_dump(one.config()))
+    (one.folder / "error.txt").write_text("RuntimeError: of an earlier time\n")
+    with pytest.raises(ValueError, match=r"ValueError: No task .*'dot'.* \(see .*cache/log.txt\)"):
+        run_on("local", [one], False, Resources(workers=1))
+
+
 def test_a_real_run_on_an_engine_leaves_the_same_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "do", do_dot)
     one = job(tmp_path, "scratch")

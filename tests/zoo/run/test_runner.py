@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import json
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +27,9 @@ from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
-from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run import learning, runner, shared
+from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 
@@ -224,6 +226,18 @@ def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
     assert not (job(tmp_path).folder / "result.json").exists()
     assert runner.run_all([job(tmp_path)])
     assert not (job(tmp_path).folder / "error.txt").exists()
+
+
+def test_a_forced_run_that_could_not_begin_is_not_finished(tmp_path, capsys):
+    one = job(tmp_path)
+    one.folder.mkdir(parents=True)
+    score = Score((1.0,))
+    done = Result("dmc", "dmc-dot", "wpt", one.variant, 0, 75, 75, "return", {"last": score})
+    write_result(one.folder, done)
+    (one.folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
+    with locked(one.folder / "lock"):
+        assert not runner.run_all([one], force=True)
+    assert "worked on by another process" in capsys.readouterr().out
 
 
 def test_a_finished_run_of_other_settings_is_refused_before_any_work(tmp_path):

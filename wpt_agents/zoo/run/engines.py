@@ -7,6 +7,7 @@ file system that all machines share. Ray and submitit are imported only when nee
 
 import shutil
 import signal
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -75,7 +76,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
     say("engine", f"{engine}: {len(left)} of {counted(len(jobs), 'run')} to do, {cpus} each")
     with shown(jobs) as tick:
         if errors := chosen.map(make_shared, list(shared.values()), tick):
-            reason = next(iter(errors.values()))
+            reason = f"{next(iter(errors.values()))} (see {jobs[0].shared.log})"
             raise ValueError(f"The data or model that the runs share could not be made: {reason}")
         errors = chosen.map(do, left, tick)
     for folder, error in errors.items():
@@ -98,11 +99,15 @@ def _at_absolute_paths(job: Run) -> Run:
 
 
 def make_shared(job: Run) -> None:
-    """Execute the shared stages of `job`."""
-    with logged(job.out / "cache" / "log.txt"):
-        dataset = collect_data(job.shared)
-        if job.algorithm.pretrained:
-            pretrain(job.shared, dataset)
+    """Execute the shared stages of `job`, with their output in the cache's `log.txt`."""
+    with logged(job.shared.log):
+        try:
+            dataset = collect_data(job.shared)
+            if job.algorithm.pretrained:
+                pretrain(job.shared, dataset)
+        except Exception:
+            traceback.print_exc()
+            raise
 
 
 def do(job: Run) -> None:
@@ -139,7 +144,9 @@ class Local:
                     if code < 0 and deaths[job.folder] <= self.resources.retries:
                         waiting.append(job)
                     elif code:
-                        errors[job.folder] = why(job, code)
+                        shared = work is make_shared
+                        trace = job.shared.log if shared else job.folder / "error.txt"
+                        errors[job.folder] = why(trace, code)
         finally:
             for process in running:
                 process.terminate()
@@ -164,16 +171,12 @@ def _in_child(work: Work, job: Run, cpus: int) -> None:
     _in_process(work, job, cpus)
 
 
-def why(job: Run, code: int) -> str:
-    """Return the last line of a failed run's traceback, or the signal that ended it."""
+def why(trace: Path, code: int) -> str:
+    """Return the last line of a failed job's traceback, or the signal that ended it."""
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
-    path = job.folder / "error.txt"
-    return (
-        path.read_text(encoding="utf-8").strip().splitlines()[-1]
-        if path.exists()
-        else f"exit code {code}"
-    )
+    lines = trace.read_text(encoding="utf-8").strip().splitlines() if trace.exists() else []
+    return lines[-1] if lines else f"exit code {code}"
 
 
 class Ray:

@@ -37,11 +37,13 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
     """
     for job in jobs:
         check_folder(job, force)
+    finished = True
     for number, job in enumerate(jobs, 1):
         say(f"run {number}/{len(jobs)}", job.title)
         try:
             done = run(job, force)
         except Exception as error:  # any failure of one run must not stop the others
+            finished = False
             console.print(f"[red]failed[/red]: {escape(str(error))}")
             if (trace := job.folder / "error.txt").exists():
                 console.print(f"Traceback: {escape(str(trace))}")
@@ -52,7 +54,7 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
     results = [result for job in jobs if (result := read_result(job.folder))]
     if len(results) > 1:
         console.print(tables.summary_table(tables.summarise(results)))
-    return len(results) == len(jobs)
+    return finished
 
 
 def run(job: Run, force: bool = False) -> Result:

@@ -1,10 +1,12 @@
 """A sequence of tasks: what is kept from task to task, and that a killed one ends alike."""
 
+import json
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 from dot_runs import DOT, SECTIONS, dot, job, make_dot  # noqa: F401
 from test_resume import KillAt, Killed
 from wpt_envs.tasks import TASKS
@@ -142,3 +144,14 @@ def test_the_command_shows_the_plan_and_refuses_what_does_not_go_together(
     assert "dmc-quadruped-roll-fast" in capsys.readouterr().out
     assert call(monkeypatch, *words, "--tasks", "walker-run") != 0
     assert "--sequence cannot be combined" in capsys.readouterr().err
+
+
+def test_a_dry_run_tells_of_a_sequence_with_other_settings(tmp_path, monkeypatch, capsys):
+    words = ["run", "--sequence", "ant", "--method", "packnet", "--preset", "debug"]
+    words += ["--dry-run", "--out", tmp_path]
+    [one] = make_sequences("ant", "debug", "1", ["packnet"], [], tmp_path, 2, "auto")
+    one.folder.mkdir(parents=True)
+    (one.folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
+    assert call(monkeypatch, *words) == 0
+    assert call(monkeypatch, *words, "--set", "packnet.batch_size=9") == 2
+    assert "other settings (packnet.batch_size)" in capsys.readouterr().err

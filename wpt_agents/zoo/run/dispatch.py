@@ -12,7 +12,7 @@ from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.run.engines import Resources, run_on
 from wpt_agents.zoo.run.folder import check_folder
 from wpt_agents.zoo.run.runner import run_all
-from wpt_agents.zoo.run.sequences import run_sequences
+from wpt_agents.zoo.run.sequences import check_sequence, run_sequences
 
 
 def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
@@ -52,4 +52,7 @@ def do_sequences(jobs: Sequence[SequenceRun], force: bool, dry_run: bool) -> boo
         show_plan(runs, force)
     check_machine("none", runs[0].device)
     check_space(runs)
+    for job in jobs:
+        check_sequence(job, force)
+    choose_threads(runs[0].preset.size)
     return dry_run or run_sequences(jobs, force)

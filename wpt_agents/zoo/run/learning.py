@@ -136,7 +136,7 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effo
     if checkpoint is not None:
         before = Effort(checkpoint.state.seconds, checkpoint.state.cpu_seconds)
         resume(run, agent, checkpoint)
-    every = run.preset.learn.checkpoint_every // repeat
+    every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up: 0 means none
     checkpoints = Checkpoints(
         run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds
     )

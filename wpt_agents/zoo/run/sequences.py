@@ -62,7 +62,7 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
     :return: whether all are finished
     """
     for job in jobs:
-        check_config(job.folder, job.config(), job.runs[0], force)
+        check_sequence(job, force)
     finished = True
     for number, job in enumerate(jobs, 1):
         say(f"sequence {number}/{len(jobs)}", job.title)
@@ -74,6 +74,14 @@ def run_sequences(jobs: Sequence[SequenceRun], force: bool = False) -> bool:
             continue
         console.print(f"Folder: [bold]{escape(str(job.folder.resolve()))}[/bold]")
     return finished
+
+
+def check_sequence(job: SequenceRun, force: bool) -> None:
+    """Raise an error for a folder that is not this sequence's.
+
+    :raises ValueError: if it is no run folder, or has other settings and `force` is off
+    """
+    check_config(job.folder, job.config(), job.runs[0], force)
 
 
 def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:

@@ -78,9 +78,14 @@ class Variant:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse `str(variant)`, from CSV cells and the result files of version 0.1."""
+        """Parse `str(variant)`, from CSV cells and the result files of version 0.1.
+
+        Keys are shortened as in later versions: "wpt.gamma" is "gamma".
+        """
         preset, *words = shlex.split(text)
-        changes = tuple(Change.parse(word) for word in words if not word.startswith("data="))
+        changes = tuple(
+            sorted(Change.parse(word).short for word in words if not word.startswith("data="))
+        )
         data = [word.removeprefix("data=") for word in words if word.startswith("data=")]
         return cls(preset, changes, data[0] if data else None)
 
@@ -263,7 +268,7 @@ def _from_json(stored: dict[str, Any]) -> Result:
     were called "WPT", or "WPT, last" and "WPT".
     """
     if "changes" in stored:
-        changes = tuple(Change(**change) for change in stored.pop("changes"))
+        changes = tuple(sorted(Change(**change).short for change in stored.pop("changes")))
         variant = Variant(stored.pop("preset"), changes, stored.pop("data"))
     else:
         variant = Variant.parse(stored.pop("preset"))

@@ -113,7 +113,7 @@ def read_sequence(folder: Path) -> SequenceResult | None:
         stored = json.loads(path.read_text(encoding="utf-8"))
         stored.pop("command")
         variant = stored.pop("variant")
-        variant["changes"] = tuple(Change(**change) for change in variant["changes"])
+        variant["changes"] = tuple(sorted(Change(**c).short for c in variant["changes"]))
         rows = [_row(row) for row in stored.pop("rows")]
         return SequenceResult(variant=Variant(**variant), rows=rows, **stored)
     except (ValueError, KeyError, TypeError, AttributeError) as error:

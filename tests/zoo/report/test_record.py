@@ -107,6 +107,29 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     )
 
 
+def test_policies_that_a_run_no_longer_has_are_dropped_when_it_is_recorded_again(tmp_path):
+    path = tmp_path / "small.csv"
+    others = [line("prior actor, no-pretrain", 4.0), line("wpt, last", 5.0, seed=1)]
+    record.update(path, [line("wpt", 1.0), line("wpt, last", 2.0), line("prior actor", 3.0)])
+    record.update(path, others)
+    again = record.update(path, [line("wpt", 9.0), line("prior actor", 8.0)])
+    assert {(one.method, one.seed): one.score for one in again} == {
+        ("wpt", 0): 9.0,
+        ("prior actor", 0): 8.0,
+        ("prior actor, no-pretrain", 0): 4.0,
+        ("wpt, last", 1): 5.0,
+    }
+
+
+def test_a_run_is_recorded_once_however_its_settings_were_written(tmp_path):
+    path = tmp_path / "small.csv"
+    record.update(path, [line("wpt", 1.0, preset="tiny gamma=0.9 size=mid")])
+    text = path.read_text().replace("gamma=0.9 size=mid", "size=mid wpt.gamma=0.9")
+    path.write_text(text)
+    [one] = record.update(path, [line("wpt", 2.0, preset="tiny gamma=0.9 size=mid")])
+    assert (str(one.preset), one.score) == ("tiny gamma=0.9 size=mid", 2.0)
+
+
 def test_presets_are_kept_apart():
     lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
     assert len({entry.run for entry in lines}) == 3

@@ -1,7 +1,8 @@
 """The record: one CSV line per task, method, seed and policy, small enough for a repository.
 
 Run folders are large and may be deleted; the record keeps their results. Lines of runs that no
-longer exist are kept, and lines of the same run are replaced.
+longer exist are kept, and lines of the same run are replaced, also those of policies that it no
+longer has.
 """
 
 import csv
@@ -16,7 +17,7 @@ from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.names import policy_name
-from wpt_agents.zoo.result import UNTRAINED, Result, Variant
+from wpt_agents.zoo.result import PRIOR_ACTOR, UNTRAINED, Result, Variant
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,13 @@ class Line:
     def run(self) -> tuple[str, str, str, int, int]:
         """The identity of the line."""
         return self.task, self.method, str(self.preset), self.frames, self.seed
+
+    @property
+    def agent(self) -> tuple[str, str, str, int, int]:
+        """The identity of the agent, which is the same for "wpt" and "wpt, last"."""
+        clone = self.method.startswith(PRIOR_ACTOR)  # "prior actor, no-pretrain" is another one
+        method = self.method if clone else self.method.split(",")[0]
+        return self.task, method, str(self.preset), self.frames, self.seed
 
 
 KNOWN = (  # of methods in tables: the simplest first, then the paper's ablation, then ours
@@ -117,7 +125,9 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
 
     :return: all lines of the updated record
     """
-    before = read(path) if path.exists() else []
+    lines = list(lines)
+    again = {line.agent for line in lines}
+    before = [line for line in read(path) if line.agent not in again] if path.exists() else []
     every = sorted({line.run: line for line in [*before, *lines]}.values(), key=order)
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")

@@ -103,3 +103,17 @@ def test_a_sequence_that_is_not_finished_is_shown_as_far_as_it_is(sequences):
 def test_a_folder_without_any_result_is_refused(monkeypatch, tmp_path, capsys):
     assert call(monkeypatch, "report", tmp_path) != 0
     assert "No finished run" in capsys.readouterr().err
+
+
+def test_sequences_have_no_lines_in_a_record(sequences, monkeypatch, tmp_path, capsys):
+    record = tmp_path / "record.csv"
+    assert call(monkeypatch, "report", sequences, "--record", record) == 0
+    assert "Page:" in capsys.readouterr().out and not record.exists()
+
+
+def test_a_task_that_ends_within_its_first_episode_has_an_empty_curve(tmp_path):
+    make_sequence(tmp_path, "packnet", [[300.0]], evaluated=False)
+    monitor = tmp_path / "tiny" / "packnet" / "ant_0" / TASKS[0] / "0.monitor.csv"
+    monitor.write_text("#{}\nr,l,t\n", encoding="utf-8")
+    [figure] = figures_4(find_sequences(tmp_path))
+    assert len(figure.curves) == 1 and figure.matrices[0].rows == [[300.0]]

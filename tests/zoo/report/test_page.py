@@ -182,6 +182,16 @@ def test_how_many_videos_the_page_holds_is_ones_choice(runs, media, videos):
     assert (runs / "index.html").read_text().count("<video") == videos
 
 
+def test_the_seeds_under_a_table_of_policies_are_those_of_each_policy(tmp_path):
+    for seed in range(2):
+        make_run(tmp_path, "dmc-walker-run", seed, "scratch")
+    make_run(tmp_path, "dmc-walker-run", 0)
+    write_page(tmp_path, tmp_path / "index.html")
+    page = text((tmp_path / "index.html").read_text())
+    assert "prior actor, wpt: seeds 0, 2 episodes each; commit 0123456789ab." in page
+    assert "scratch: seeds 0, 1, 2 episodes each" in page
+
+
 def test_what_failed_is_told_and_escaped(page):
     assert "RuntimeError: &lt;out&gt; of luck" in page
 
@@ -221,6 +231,18 @@ def test_every_colour_of_the_figures_is_on_the_page_light_and_dark(page):
     assert f"% {len(figures.SERIES)} + 1" in template  # the key's
 
 
+def test_the_key_tells_methods_of_one_colour_apart(tmp_path):
+    methods = list(METHODS)
+    for method in methods:
+        make_run(tmp_path, "dmc-walker-run", method=method)
+    write_page(tmp_path, tmp_path / "index.html")
+    page = (tmp_path / "index.html").read_text()
+    key = re.search(r'<div class="key">.*?</div>', page, re.S)[0]
+    swatches = re.findall(r'<i style="background: ([^"]*)"></i>([^<]*)', key)
+    assert [label for _, label in swatches] == methods
+    assert len({look for look, _ in swatches}) == len(methods)
+
+
 def test_a_policy_is_above_another_when_their_intervals_over_seeds_are_apart():
     high, low, wide, single = [9, 10, 11], [1, 2, 3], [0, 2, 10], [1]
     assert headline.above(high, low) and not headline.above(low, high)
@@ -243,6 +265,35 @@ def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
     make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
     [line] = headline.both_suites(read_results(tmp_path))
     assert line.ours == pytest.approx((0.5 + 0.1) / 2)
+
+
+@pytest.fixture
+def further(tmp_path):
+    """Runs of walker-run (0.728 in the paper), and of a task that is not in the paper."""
+    make_run(tmp_path, "dmc-walker-run", returns=(700.0, 760.0))
+    make_run(tmp_path, "dmc-quadruped-escape", returns=(0.0, 0.0))
+    make_run(tmp_path, "metaworld-reach", returns=(9.0, 1.0))  # 0.5
+    return tmp_path
+
+
+def test_the_papers_means_stand_beside_ours_over_the_same_tasks(further):
+    [line] = headline.both_suites(read_results(further))
+    assert line.ours == pytest.approx((0.73 + 0.5) / 2)
+    write_page(further, further / "index.html")
+    page = (further / "index.html").read_text()
+    table = re.search(r'<section id="table-5">.*?</section>', page, re.S)[0]
+    mean = text(re.search(r'<tr class="aggregate"><td>mean</td>.*?</tr>', table, re.S)[0])
+    assert mean.startswith(" mean 730 of 1 task ")  # the rows of the table
+    assert "debug, 1,000 frames 1 of 22 and 1 not in the paper 2 0.36" in text(page)
+    assert "0.73 of 1 task" in text(page)  # the paper's
+
+
+def test_a_table_whose_tasks_were_not_run_has_no_mean(tmp_path):
+    make_run(tmp_path, "dmc-quadruped-escape")
+    write_page(tmp_path, tmp_path / "index.html")
+    page = (tmp_path / "index.html").read_text()
+    table = re.search(r'<section id="table-5">.*?</section>', page, re.S)[0]
+    assert text(re.search(r"<td>mean</td>.*?</tr>", table, re.S)[0]).startswith(" mean – ")
 
 
 def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):

@@ -140,6 +140,12 @@ def test_rows_leave_out_changed_settings_and_show_the_papers_score_hollow():
     ]
 
 
+def test_policies_in_between_are_not_drawn_in_rows_at_any_budget():
+    names = ["wpt, last", "wpt, last, 3x frames", "wpt+, after head start, 3x frames", "nothing"]
+    assert not any(map(record_picture.drawn, names))
+    assert all(map(record_picture.drawn, ["wpt", "prior actor, no-pretrain", "scratch, 3x frames"]))
+
+
 def test_labels_of_several_lines_have_room_in_a_panel():
     lines = [line("wpt", "hammer", 5.0, preset=f"mid x={i} y={i}") for i in range(3)]
     figure = record_picture.draw_panels(lines)

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 from dot_runs import dot  # noqa: F401  (dot registers the task for each test)
@@ -76,6 +77,16 @@ def test_untrained_policies_are_told_once_however_many_methods_met_them():
     assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in table
     assert "| scratch | 5.0 |" in table
     assert "Seeds 0, 2 episodes each; commit abc." in table
+
+
+def test_seeds_and_commits_are_those_of_each_policy_where_they_differ():
+    results = [fake_result(seed, 5.0) for seed in range(3)]
+    results += [replace(fake_result(7, 5.0, "scratch"), commit="def")]
+    note = tables.policy_note(tables.policies(results))
+    assert note == (
+        "scratch: seeds 7, 2 episodes each; commit def. "
+        "wpt: seeds 0, 1, 2, 2 episodes each; commit abc."
+    )
 
 
 def test_the_csv_reads_back_unrounded():

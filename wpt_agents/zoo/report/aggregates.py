@@ -84,6 +84,11 @@ def references() -> tuple[Reference, ...]:
     return tuple(references)
 
 
+def paper_tasks(suite: str) -> set[str]:
+    """Return the tasks of a suite for which the paper has scores."""
+    return {r.task for r in references() if r.suite == suite and r.task not in STATISTICS}
+
+
 def normalised(score: float, metric: str) -> float:
     """Return a score normalised to a maximum of 1."""
     return score if metric == "success" else score / BEST_RETURN
@@ -133,10 +138,14 @@ def improvement(
 
 @dataclass(frozen=True)
 class Aggregate:
-    """The paper's normalised mean and median over some tasks."""
+    """The paper's normalised mean and median over some tasks.
+
+    :param tasks: the number of tasks
+    """
 
     mean: float
     median: float
+    tasks: int
 
 
 def paper_aggregate(
@@ -152,7 +161,9 @@ def paper_aggregate(
         and row.task in names
         and row.score is not None
     ]
-    return Aggregate(float(np.mean(scores)), float(np.median(scores))) if scores else None
+    if not scores:
+        return None
+    return Aggregate(float(np.mean(scores)), float(np.median(scores)), len(scores))
 
 
 def misprint(row: Reference) -> float | None:

@@ -163,13 +163,16 @@ def _matrix(name: str, finished: Sequence[Finished], share: float | None) -> Mat
 def _curve(folder: Path, result: SequenceResult, task: str) -> tuple[np.ndarray, np.ndarray]:
     """Return frames (N,) and returns (N, episodes) of learning one task.
 
-    They are the evaluations, or means of training episodes if there are none.
+    They are the evaluations, or means of training episodes if there are none; N is 0 if learning
+    ended within the first episode.
     """
     repeat = result.frames / result.steps
     evaluated = Evaluations.read(folder / task / EVALUATIONS)
     if evaluated is not None:
         return evaluated.steps * repeat, np.asarray(evaluated.returns, float)
     played = TrainingEpisodes.read(folder / task / MONITOR)
+    if not len(played):
+        return np.empty(0), np.empty((0, 1))
     points = max(len(played) // WINDOW, 1)
     parts = np.array_split(np.arange(len(played)), points)
     frames = played.lengths.cumsum()[[part[-1] for part in parts]] * repeat

@@ -100,19 +100,24 @@ class BothSuites:
 
 
 def both_suites(results: Sequence[Result]) -> list[BothSuites]:
-    """Return the paper's aggregate for each preset and method that has runs of both suites."""
+    """Return the paper's aggregate for each preset and method that has runs of both suites.
+
+    Tasks that are not in the paper do not count.
+    """
     runs: dict[tuple[str, Variant], dict[str, Mapping[str, list[float]]]] = defaultdict(dict)
     every = aggregates.by_experiment(results).items()
     for one, tasks in sorted(every, key=_largest_budget_first):  # keeps the smallest budget
-        runs[one.method, one.variant][one.suite] = tasks
+        printed = aggregates.paper_tasks(one.suite)
+        if common := {task: scores for task, scores in tasks.items() if task in printed}:
+            runs[one.method, one.variant][one.suite] = common
     means = []
     for (method, preset), suites in runs.items():
         if not {"dmc", "metaworld"} <= suites.keys():
             continue
         pairs = [(suite, suites[suite]) for suite in ("dmc", "metaworld")]
         ours = [float(mean([np.array(runs) for runs in tasks.values()])) for _, tasks in pairs]
-        printed = [aggregates.paper_aggregate(*pair, method, PAPER_BUDGET) for pair in pairs]
-        theirs = [aggregate.mean for aggregate in printed if aggregate is not None]
+        papers = [aggregates.paper_aggregate(*pair, method, PAPER_BUDGET) for pair in pairs]
+        theirs = [aggregate.mean for aggregate in papers if aggregate is not None]
         paper = float(np.mean(theirs)) if len(theirs) == len(pairs) else None
         means.append(BothSuites(method, preset, float(np.mean(ours)), paper))
     return means

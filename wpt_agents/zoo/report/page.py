@@ -73,6 +73,7 @@ def render(
         policies=tables.by_task(tables.policies(results)),
         policy_cells=tables.policy_cells,
         policy_headings=tables.POLICY_HEADINGS,
+        policy_note=tables.policy_note,
         runs=[card(run, names, media in illustrated(run, runs)) for run in runs],
         unfinished=unfinished,
         headline=headline.headlines(results),

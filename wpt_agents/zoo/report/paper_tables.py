@@ -127,8 +127,7 @@ def table_row(
     ]
     if task in STATISTICS:
         our_cells: list[Cell | None] = [
-            our_aggregate(task, [runs for (_, name), runs in cells.items() if name == column])
-            for column in ours
+            our_aggregate(task, of_paper(cells, column, printed[0].suite)) for column in ours
         ]
     else:
         our_cells = [our_cell(cells.get((task, column), [])) for column in ours]
@@ -150,8 +149,16 @@ def without_notes(row: TableRow, notes: Sequence[str]) -> TableRow:
     return replace(row, ours=cells)
 
 
-def our_aggregate(name: str, tasks: Sequence[Sequence[Finished]]) -> Cell:
+def of_paper(cells: Cells, column: str, suite: str) -> list[Sequence[Finished]]:
+    """Return the runs of a column on each of the paper's tasks, which the tables have rows for."""
+    tasks = aggregates.paper_tasks(suite)
+    return [runs for (task, name), runs in cells.items() if name == column and task in tasks]
+
+
+def our_aggregate(name: str, tasks: Sequence[Sequence[Finished]]) -> Cell | None:
     """Return the mean or median over tasks of each task's mean over seeds, in the table's units."""
+    if not tasks:
+        return None
     scores = [np.array([run.result.counted() for run in runs]) for runs in tasks]
     return Cell(float(STATISTICS[name](scores)), tasks=len(scores))
 

@@ -96,7 +96,7 @@ def draw_rows(suites: Sequence[Evidence]) -> Figure:
 
 def drawn(method: str) -> bool:
     """Return whether a method is shown in rows of tasks; the tables show all methods."""
-    return method != "nothing" and not method.endswith((", last", ", after head start"))
+    return method != "nothing" and not {"last", "after head start"} & set(method.split(", "))
 
 
 def _draw_suite(panel: Axes, one: Evidence, styles: dict[str, Style]) -> None:

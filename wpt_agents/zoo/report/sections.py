@@ -42,11 +42,15 @@ class Names:
 
 @dataclass(frozen=True)
 class MethodRow:
-    """One experiment in the table of all tasks together."""
+    """One experiment in the table of all tasks together.
+
+    :param further: the number of tasks that are not in the paper, if others of the suite are
+    """
 
     name: str
     budget: str
     tasks: int
+    further: int
     runs: int
     estimates: Mapping[str, Estimate]
     paper: Aggregate | None
@@ -116,10 +120,12 @@ def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
 
 def method_row(one: Experiment, tasks: Scores, names: Names) -> MethodRow:
     """Return the row of an experiment, with the paper's aggregate over the same tasks."""
+    printed = aggregates.paper_tasks(one.suite)
     return MethodRow(
         name=names(one),
         budget=one.budget,
         tasks=len(tasks),
+        further=len(tasks.keys() - printed) if printed else 0,
         runs=sum(map(len, tasks.values())),
         estimates=aggregates.aggregate(tasks),
         paper=aggregates.paper_aggregate(one.suite, tasks, one.method, PAPER_BUDGET),

@@ -247,14 +247,22 @@ def policy_markdown(rows: Sequence[PolicyRow]) -> str:
     """Return a Markdown table for each task, with seeds and commits under it."""
     parts = []
     for title, table in by_task(rows).items():
-        seeds = sorted({seed for row in table for seed in row.seeds})
-        commits = sorted({commit for row in table for commit in row.commits})
-        episodes = min(row.episodes for row in table)
-        note = f"Seeds {', '.join(map(str, seeds))}, {counted(episodes, 'episode')} each; "
-        note += f"commit {', '.join(commits)}."
         lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
-        parts.append(f"### {title}\n\n{lines}\n{note}\n")
+        parts.append(f"### {title}\n\n{lines}\n{policy_note(table)}\n")
     return "\n".join(parts)
+
+
+def policy_note(rows: Sequence[PolicyRow]) -> str:
+    """Return the seeds, episodes and commits of a table, of each policy if they differ."""
+    notes: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        seeds = ", ".join(map(str, row.seeds))
+        commits = ", ".join(row.commits)
+        note = f"seeds {seeds}, {counted(row.episodes, 'episode')} each; commit {commits}."
+        notes[note].append(policy_title(row.name))
+    if len(notes) == 1:
+        return next(iter(notes)).replace("s", "S", 1)
+    return " ".join(f"{', '.join(names)}: {note}" for note, names in notes.items())
 
 
 def policy_csv(rows: Sequence[PolicyRow]) -> str:

@@ -40,9 +40,11 @@ def report(
 
     --record keeps the numbers when the run folders are deleted; a Markdown page and a picture are
     written beside the CSV file. If FOLDER has no finished run, only these two are written again.
+    Sequences of tasks are in the page, but not in records.
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """
+    from wpt_agents.files.archive import replacing
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_page, tables
     from wpt_agents.zoo.report.figure4 import (
@@ -60,18 +62,20 @@ def report(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
     results = read_results(folder)
-    if not results and record is not None and record.exists() and (kept := records.read(record)):
+    sequences = figures_4(find_sequences(folder))
+    kept = records.read(record) if not results and record is not None and record.exists() else []
+    if record is not None and kept:
         record_page.write(record, kept)
         console.print(f"No finished run below {folder}: {record} stays, its pages are renewed.")
-        return
-    sequences = figures_4(find_sequences(folder))
+        if not sequences:
+            return
     if not results and not sequences:
         raise ValueError(f"No finished run below {folder}: there is no result.json.")
     rows = tables.summarise(results)
     policies = tables.policies(results)
     parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
     as_markdown = "\n".join([*parts, *([sequence_markdown(sequences)] if sequences else [])])
-    if record is not None:
+    if record is not None and results:
         lines = records.update(record, records.lines_of(find_finished(folder)))
         record_page.write(record, lines)
     if csv:
@@ -81,8 +85,10 @@ def report(
     else:
         page = (out or folder / "report") / "index.html"
         write_page(folder, page, media)
-        page.with_name("report.md").write_text(as_markdown, encoding="utf-8")
-        page.with_name("policies.csv").write_text(tables.policy_csv(policies), encoding="utf-8")
+        beside = {"report.md": as_markdown, "policies.csv": tables.policy_csv(policies)}
+        for name, text in beside.items():
+            with replacing(page.with_name(name)) as temporary:
+                temporary.write_text(text, encoding="utf-8")
         if rows:
             console.print(tables.summary_table(rows))
         if sequences:

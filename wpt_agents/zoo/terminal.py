@@ -6,14 +6,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from tqdm.auto import tqdm
 
 console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
-def say(stage: str, text: str) -> None:
-    """Print a line about a stage, above its progress bar."""
-    console.print(f"[bold]{stage:<10}[/bold]{text}")
+def say(stage: str, text: str, path: Path | None = None) -> None:
+    """Print a line about a stage, above its progress bar, with the path of its result, if any."""
+    where = "" if path is None else f"  {dim(path)}"
+    console.print(f"[bold]{stage:<10}[/bold]{text}{where}")
+
+
+def dim(path: Path) -> str:
+    """Return a path as grey text; brackets in it are not markup."""
+    return f"[dim]{escape(str(path))}[/dim]"
 
 
 def progress(

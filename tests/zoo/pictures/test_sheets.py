@@ -98,7 +98,7 @@ def test_the_sheet_of_a_run_shows_what_the_run_retrieves(dataset, images, tmp_pa
     monkeypatch.setattr(retrieval, "retrieval_sheet", lambda _, __, rows: shown.extend(rows))
     venv = make_vec_env(DOT.id, {"rendering": "fast"}, 5)
     settings = {"retrieval_images": images, "num_retrieve": 3, "bc_steps": 1}
-    model = agent(venv, dataset=dataset, embodiment="dot", **settings)
+    model = agent(venv, dataset=dataset, embodiment="dot", seed=5, **settings)
     retrieval.sheet_of_run(tmp_path / "a.png", model, DOT, {"rendering": "fast"}, 5)
     model._last_obs = venv.reset()
     model._last_episode_starts = np.ones(1, bool)

@@ -125,8 +125,11 @@ def _without_times(path):
 def test_a_finished_run_is_not_done_again_unless_forced(tmp_path, monkeypatch):
     first = run(job(tmp_path))
     done = (job(tmp_path).folder / "result.json").stat().st_mtime_ns
+    for name in ("checkpoints", "replay"):  # of a process that was killed right after its result
+        (job(tmp_path).folder / name).mkdir()
     assert run(job(tmp_path)) == first
     assert (job(tmp_path).folder / "result.json").stat().st_mtime_ns == done
+    assert not {"checkpoints", "replay"} & {path.name for path in job(tmp_path).folder.iterdir()}
     monkeypatch.setattr(runner, "do_stages", lambda job: "done again")
     assert run(job(tmp_path), force=True) == "done again"
 

@@ -44,6 +44,8 @@ def report(
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
     """
+    from rich.markup import escape
+
     from wpt_agents.files.archive import replacing
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_page, tables
@@ -66,7 +68,8 @@ def report(
     kept = records.read(record) if not results and record is not None and record.exists() else []
     if record is not None and kept:
         record_page.write(record, kept)
-        console.print(f"No finished run below {folder}: {record} stays, its pages are renewed.")
+        kept_as = f"No finished run below {folder}: {record} stays, its pages are renewed."
+        console.print(kept_as, markup=False)
         if not sequences:
             return
     if not results and not sequences:
@@ -93,4 +96,5 @@ def report(
             console.print(tables.summary_table(rows))
         if sequences:
             console.print(sequence_table(sequences))
-        console.print(f"Page: [bold]{page.resolve()}[/bold]; beside it report.md, policies.csv")
+        where = escape(str(page.resolve()))
+        console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.files.names import counted
@@ -9,7 +10,7 @@ from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.sequence_result import read_row
 from wpt_agents.zoo.tasks import short_name
-from wpt_agents.zoo.terminal import console
+from wpt_agents.zoo.terminal import console, dim
 
 
 def show_plan(jobs: Sequence[Run], force: bool) -> None:
@@ -20,13 +21,13 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
         state = "finished" if done and not force else "to do"
         updates = "-" if job.updates is None else f"{job.updates:,}"
         names = short_name(job.task), job.method, str(job.seed)
-        table.add_row(*names, f"{job.preset.steps:,}", updates, state, str(job.folder))
+        table.add_row(*names, f"{job.preset.steps:,}", updates, state, escape(str(job.folder)))
     console.print(table)
     datasets = {job.shared.data_path: job.shared for job in jobs if job.algorithm.needs_data}
     for path, shared in datasets.items():
         episodes = counted(shared.preset.collect.episodes * len(shared.tasks), "episode")
         state = "exists" if path.exists() else f"{episodes} to collect"
-        console.print(f"dataset      {state}  [dim]{path}")
+        console.print(f"dataset      {state}  {dim(path)}")
     models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
     for path, shared in models.items():
         if ships := shared.shipped:
@@ -34,4 +35,4 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
             continue
         updates = counted(shared.preset.pretrain.steps, "update")
         state = "exists" if (path / "done.json").exists() else f"{updates} to make"
-        console.print(f"world model  {state}  [dim]{path}")
+        console.print(f"world model  {state}  {dim(path)}")

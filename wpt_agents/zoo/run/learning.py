@@ -115,7 +115,7 @@ def build_index(run: Run, agent: BaseAlgorithm) -> None:
     state = "made" if set(folder.iterdir()) - before else "reused"
     share = retriever.own_share()
     same = "" if share is None else f", {share:.0%} of the nearest are of the query's own robot"
-    say("index", f"{state}, {len(retriever)} first images{same}  [dim]{agent.dataset.path}")
+    say("index", f"{state}, {len(retriever)} first images{same}", folder)
     if run.retrieves and agent.retrieval == "nearest":
         picture = run.folder / "retrieval.png"
         retrieval.sheet_of_run(picture, agent, run.task, run.shared.env, run.seed)

@@ -62,7 +62,8 @@ def run(job: Run, force: bool = False) -> Result:
     check_folder(job, force)
     done = None if force else read_result(job.folder)
     if done is not None:
-        say("run", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")
+        say("run", "finished earlier, reused (--force replaces it)", job.folder)
+        remove_checkpoints(job.folder)  # left if the process was killed right after its result
         return done
     with locked(job.folder / "lock"):
         if force:

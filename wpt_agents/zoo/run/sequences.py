@@ -88,7 +88,8 @@ def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
     """Learn the unfinished tasks of a sequence, and return its result."""
     done = None if force else read_sequence(job.folder)
     if done is not None and done.finished:
-        say("sequence", f"finished earlier, reused (--force replaces it)  [dim]{job.folder}")
+        say("sequence", "finished earlier, reused (--force replaces it)", job.folder)
+        _remove_episodes(job)  # left if the process was killed right after its last task
         return done
     with locked(job.folder / "lock"):
         if force:
@@ -119,9 +120,14 @@ def _do_tasks(job: SequenceRun) -> SequenceResult:
         result = _result(job, rows)
         write_sequence(job.folder, result)
         say("return", f"{row.learned.mean:.1f} on {row.task}")
+    _remove_episodes(job)
+    return result
+
+
+def _remove_episodes(job: SequenceRun) -> None:
+    """Delete the episodes of a finished sequence."""
     for run in job.runs:
         shutil.rmtree(run.folder / "replay", ignore_errors=True)
-    return result
 
 
 def _result(job: SequenceRun, rows: Sequence[Row]) -> SequenceResult:

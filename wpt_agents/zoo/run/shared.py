@@ -32,7 +32,7 @@ def collect_data(shared: Shared) -> TrajectoryDataset:
     if shared.given_data is not None:
         dataset = TrajectoryDataset.open(shared.given_data)
         size = counted(len(dataset), "episode")
-        say("collect", f"your own data, {size}  [dim]{shared.data_path}")
+        say("collect", f"your own data, {size}", shared.data_path)
         _warn_of_differences(shared)
         return dataset
     with locked(shared.cache / f"lock-{shared.data_path.name}", wait=True):
@@ -51,7 +51,7 @@ def _collected(shared: Shared) -> TrajectoryDataset:
     state = "reused" if stored == total else f"continued at {stored} of" if stored else "making"
     names = ", ".join(settings.tasks) or f"all tasks of {shared.suite}"
     episodes = counted(total, "reward-free episode")
-    say("collect", f"{state} {episodes} of {names}  [dim]{shared.data_path}")
+    say("collect", f"{state} {episodes} of {names}", shared.data_path)
     return collect(
         shared.data_path,
         shared.tasks,
@@ -78,7 +78,7 @@ def _warn_of_differences(shared: Shared) -> None:
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: pre-train the model unless it is finished, and return its file."""
     if name := shared.shipped:
-        say("pretrain", f"the shipped model {name}  [dim]{shipped_model(name)}")
+        say("pretrain", f"the shipped model {name}", shipped_model(name))
         return shipped_model(name)
     folder = shared.model_path
     world = World.current()
@@ -89,7 +89,7 @@ def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
         state = "reused" if finished else "continued" if model.exists() else "making"
         updates = counted(shared.preset.pretrain.steps, "update")
         what = "a world model" if shared.agent is WPT else f"the encoder of {shared.agent.__name__}"
-        say("pretrain", f"{state} {what} of {updates}  [dim]{folder}")
+        say("pretrain", f"{state} {what} of {updates}", folder)
         if not finished:
             start = time.perf_counter()
             _pretrain(shared, dataset)

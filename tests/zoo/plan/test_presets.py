@@ -410,9 +410,6 @@ def test_data_too_wide_for_a_shipped_model_are_refused_with_a_remedy_that_works(
     assert plan(*where, settings, data=tmp_path / "own")
 
 
-def test_only_wpt_starts_from_a_shipped_model(tmp_path):
-    where = "metaworld", ["drawer-close"], "mid", tmp_path
-    [run] = plan(*where)
-    assert run.shared.shipped == "metaworld-mid"
-    [run] = plan(*where, "r3m", ["pretrain.steps=5"])
-    assert run.shared.shipped == "" and run.preset.pretrain.steps == 5
+def test_other_agents_are_pre_trained_by_as_many_updates_as_the_user_sets(tmp_path):
+    [run] = plan("metaworld", ["drawer-close"], "mid", tmp_path, "r3m", ["pretrain.steps=5"])
+    assert run.preset.pretrain.steps == 5

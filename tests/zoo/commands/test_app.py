@@ -130,8 +130,8 @@ def test_collecting_ends_in_a_summary_of_what_there_is(monkeypatch, capsys, tmp_
 
 
 def test_the_whole_command_line_runs_and_reports(monkeypatch, capsys, tmp_path):
-    own = ("env", "collect", "pretrain", "learn", "evaluate", "wpt")  # not of other agents
-    sections = [f"{t}.{k}={json.dumps(v)}" for t in own for k, v in SECTIONS[t].items()]
+    titles = ("env", "collect", "pretrain", "learn", "evaluate", "wpt")  # not of other agents
+    sections = [f"{t}.{k}={json.dumps(v)}" for t in titles for k, v in SECTIONS[t].items()]
     words = ["run", "--preset", "debug", "--tasks", "dot", "--out", tmp_path, "--workers", "1"]
     assert call(monkeypatch, *words, "--frames", "50", "--set", *sections) == 0
     folder = tmp_path / "debug" / "wpt" / "dmc-dot_0"

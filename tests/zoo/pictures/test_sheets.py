@@ -103,9 +103,9 @@ def test_the_sheet_of_a_run_shows_what_the_run_retrieves(dataset, images, tmp_pa
     model._last_obs = venv.reset()
     model._last_episode_starts = np.ones(1, bool)
     model.retrieve()
-    own, every = shown
-    assert own.indices.tolist() == model.progress.retrieved_ids
-    assert len(every.indices) == 5 and (f"for {images}" in own.query.name) == (images > 1)
+    retrieved, every = shown
+    assert retrieved.indices.tolist() == model.progress.retrieved_ids
+    assert len(every.indices) == 5 and (f"for {images}" in retrieved.query.name) == (images > 1)
 
 
 def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, monkeypatch, capsys):

@@ -1,10 +1,14 @@
 """A dataset whose folder disappears while it is read, as a disk does that is unmounted."""
 
+import errno
+import os
+
 import pytest
 from debug_agent import pretrained, recorded, same, weights
 
 from wpt_agents.data import reading
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.folder import Folder
 from wpt_agents.training import pretraining
 
 
@@ -58,6 +62,34 @@ def test_a_folder_that_comes_back_in_time_is_read_on(store, monkeypatch):
     unmount(store)
     monkeypatch.setattr(reading.time, "sleep", lambda _: mount(store))
     assert (store[2].image == expected).all()
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EACCES])
+def test_what_says_nothing_about_a_file_is_not_called_damage(store, monkeypatch, number):
+    dataset = TrajectoryDataset.open(store.path)
+
+    def read(*_):
+        raise OSError(number, os.strerror(number), "shard-00000.bin")
+
+    monkeypatch.setattr(Folder, "read", read)
+    with pytest.raises(OSError, match=f"{os.strerror(number)}: 'shard-00000.bin'"):
+        dataset.validate(set_aside=True)
+    assert not (store.path / "damaged.json").exists()
+
+
+def test_a_stale_handle_of_a_network_disk_is_tried_again(store, paused, monkeypatch):
+    dataset = TrajectoryDataset.open(store.path)
+    read = Folder.read
+    errors = [OSError(errno.ESTALE, "Stale file handle")]
+
+    def stale(folder, *arguments):
+        if errors:
+            raise errors.pop()
+        return read(folder, *arguments)
+
+    monkeypatch.setattr(Folder, "read", stale)
+    assert len(dataset[0]) > 0
+    assert not errors
 
 
 def test_trajectories_that_cannot_be_reached_are_not_called_damaged(store, paused, tmp_path):

@@ -1,5 +1,6 @@
 """Reading stored trajectories: by number, by sequence, or by batch."""
 
+import errno
 import hashlib
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -15,6 +16,8 @@ from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.data.windows import Piece, Windows, make_batch
 
 T = TypeVar("T")
+# What says nothing about a file: too many open files, no permission, no memory.
+OTHER_CAUSES = (errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM)
 PAUSES = (1.0, 4.0, 15.0)  # seconds between attempts to read a folder that has disappeared
 
 
@@ -242,13 +245,16 @@ class StoredTrajectories:
 
         :raises ValueError: the trajectory is damaged
         :raises FileNotFoundError: the folder has disappeared and does not come back
+        :raises OSError: the process may not read the file, or has too many files open
         """
         folder = self._folder(i)
         for pause in (*PAUSES, None):
             try:
                 return read(folder, self._entries[i])
             except OSError as error:
-                if folder.is_there():
+                if error.errno in OTHER_CAUSES:
+                    raise
+                if error.errno != errno.ESTALE and folder.is_there():
                     raise self._damaged(i, error) from error
                 if pause is None:
                     raise self._gone(folder, error) from error

@@ -439,6 +439,54 @@ def test_rows_of_dreamer_are_shifted_back(tmp_path):
         assert new.terminated
 
 
+def test_a_part_of_a_dreamer_episode_is_asked_about(tmp_path):
+    save_dreamer(tmp_path / "a.npz", [chain(9, 0, terminated=True)])
+    with np.load(tmp_path / "a.npz") as whole:
+        arrays = {name: whole[name][3:] for name in whole.files}
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(ValueError, match=r"no row is marked as the first.* \(reset\): pass shift"):
+        open_episodes(tmp_path, **SMALL)
+    [new] = open_episodes(tmp_path, shifted=True, **SMALL)
+    np.testing.assert_array_equal(new.action, chain(9, 0).action[3:])
+
+
+@pytest.mark.parametrize("mark", ["is_first", "step_type"])
+def test_an_episode_that_broke_off_ends_where_the_next_begins(tmp_path, mark):
+    old = [chain(5, 0), chain(7, 1, terminated=True), chain(6, 2)]
+    path = save_dm_env(tmp_path / "a.hdf5", old)
+    with h5py.File(path, "a") as file:
+        types = file["step_type"][:]
+        types[5] = 1  # the last step of the first episode is no end
+        types[-1] = 1
+        del file["step_type"]
+        file[mark] = types == 0 if mark == "is_first" else types
+        if mark == "is_first":
+            file["terminals"] = types == 2
+    new = open_episodes(path, **SMALL)
+    for episode, expected in zip(new, old, strict=True):
+        check(episode, expected)
+        assert episode.terminated == expected.terminated
+
+
+def test_files_of_dreamers_rows_are_shifted_back_and_cut_where_episodes_begin(tmp_path):
+    old = [chain(5, 0, terminated=True), chain(7, 1), chain(6, 2)]
+    blank = np.zeros((1, 2), np.float32)
+    for name, part in (("0.h5", old[:1]), ("1.h5", old[1:])):
+        arrays = {
+            "image": np.concatenate([t.image for t in part]),
+            "action": np.concatenate([a for t in part for a in (blank, t.action)]),
+            "is_first": np.concatenate([np.arange(len(t) + 1) == 0 for t in part]),
+            "is_terminal": np.concatenate(
+                [t.terminated * (np.arange(len(t) + 1) == len(t)) for t in part]
+            ),
+        }
+        save(tmp_path / name, arrays)
+    for source, expected in ((tmp_path, old), (tmp_path / "0.h5", old[:1])):
+        for episode, t in zip(open_episodes(source, **SMALL), expected, strict=True):
+            check(episode, t)
+            assert episode.terminated == t.terminated
+
+
 def test_rows_whose_episodes_all_begin_with_a_zero_action_are_questioned(tmp_path, recwarn):
     old = [chain(5, 0), chain(7, 1)]
     save_dreamer(tmp_path / "a.npz", old, marked=False)

@@ -18,7 +18,7 @@ import numpy as np
 from wpt_agents.data.importers import keys
 from wpt_agents.data.importers.keys import Keys, Table, count, first
 
-LAST = 2  # dm_env's step type
+FIRST, LAST = 0, 2  # dm_env's step types
 MARKS = ("step_type", "is_first", "reset")  # of files whose actions led to their observation
 CHUNK = 64  # images that are read at once
 EXAMINED = 100  # episodes whose first actions are read
@@ -64,16 +64,18 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
     """
     rows = length(table, columns)
     names = _flags(table, done_key)
-    if not names:
+    begins = starts(table, rows)
+    if not names and not len(begins):
         raise ValueError(
             "nothing says where episodes end: needs 'terminals', 'timeouts', 'terminations', "
             "'truncations', 'dones', 'step_type' or 'episode_ends', or done_key (--done-key); "
             f"there are: {', '.join(table)}. If these rows are one episode, add the array "
             f"episode_ends = [{rows}] to the file"
         )
-    ends = np.concatenate([_ends(np.ravel(table[name][:]), name, rows) for name in names])
+    # A recorder that was stopped leaves episodes without an end, before the start of the next.
+    ends = np.concatenate([begins, *(_ends(np.ravel(table[n][:]), n, rows) for n in names)])
     # Flags leave an unfinished episode at the end; numbers name all episodes.
-    if any(_is_flag(table[name], name, rows) for name in names):
+    if not names or any(_is_flag(table[name], name, rows) for name in names):
         ends = np.append(ends, rows)
     elif rows > (last := int(ends.max(initial=0))):
         warnings.warn(
@@ -91,6 +93,17 @@ def cut(table: Table, columns: Keys, done_key: str | None, shifted: bool | None)
     shortest = 1 if columns.next_image and not shifted else 2
     bounds = tuple((a, b) for a, b in pairwise(edges) if b - a >= shortest)
     return Cut(bounds, shifted, len(edges) - 1 - len(bounds), doubtful)
+
+
+def starts(table: Table, rows: int) -> np.ndarray:
+    """Return the rows that are marked as the first of an episode, if the first row is."""
+    marked = [np.zeros(0, int)]
+    for name in MARKS:
+        if name in table and count(table[name]) == rows:
+            marks = np.ravel(table[name][:])
+            first_rows = np.flatnonzero(marks == FIRST if name == "step_type" else marks)
+            marked += [first_rows] if 0 in first_rows else []
+    return np.concatenate(marked)
 
 
 def is_one_episode(table: Table, columns: Keys, done_key: str | None) -> bool:
@@ -155,14 +168,20 @@ def _led_to(table: Table, empty: bool) -> bool:
 
     :param empty: whether the first actions of episodes are zero, as placeholders are
     """
-    if "step_type" in table and not empty:
+    mark = first(MARKS, table)
+    problem = None
+    if mark == "step_type" and not empty:
+        problem = "is zero, but here it is not"
+    elif mark is not None and mark != "step_type" and not np.any(table[mark][:]):
+        problem = f"is zero, but no row is marked as the first: these are parts ({mark})"
+    if problem is not None:
         raise ValueError(
-            "'step_type' comes from dm_env, where the action of a row led to its observation and "
-            "the first action of an episode is zero, but here it is not: pass shifted=True if it "
+            f"{mark!r} comes from dm_env or Dreamer, where the action of a row led to its "
+            f"observation and the first action of an episode {problem}: pass shifted=True if it "
             "did (--shifted), or shifted=False if the action was taken at the observation "
             "(--no-shifted)"
         )
-    return empty and first(MARKS, table) is not None
+    return empty and mark is not None
 
 
 def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarray:
@@ -200,6 +219,8 @@ def episode(
         over = _is_flagged(table, columns, stop - 1)
         if "discount" in table:
             over = not np.any(table["discount"][stop - 1 : stop])
+        elif "is_terminal" in table:
+            over = bool(np.any(table["is_terminal"][stop - 1 : stop]))
         return image, action[1:], None if reward is None else reward[1:], over
     if columns.next_image is None:
         return image, action[:-1], None if reward is None else reward[:-1], False
@@ -226,4 +247,6 @@ def whole(
         return image, read_actions(table, columns, 0, rows), reward, over
     if images != rows:
         raise ValueError(f"{rows} actions for {images} images")
-    return episode(table, columns, 0, rows, bool(shifted))
+    if shifted is None:
+        shifted = _led_to(table, _beginnings(table, columns, [0])[0])
+    return episode(table, columns, 0, rows, shifted)

@@ -118,6 +118,7 @@ class TableEpisodes(Episodes):
         keys = find_keys(table, self.image_key, self.action_keys)
         self._say_camera(keys)
         flags = self.done_key is not None or first(ENDS, table) is not None
+        flags = flags or len(rows.starts(table, count(table[keys.actions[0]]))) > 1
         alone = several or keys.image.startswith("observations/images/")
         if (alone and not flags) or rows.is_one_episode(table, keys, self.done_key):
             return self._add_whole(file, "", table, keys, task)

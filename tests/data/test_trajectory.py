@@ -45,6 +45,11 @@ def test_the_remedy_for_images_of_another_form_works(make):
     np.testing.assert_array_equal(new.image, old.image)
 
 
+def test_states_are_not_to_be_scaled_as_images_are():
+    with pytest.raises(ValueError, match=r"got \(4, 3\) float32$"):
+        Trajectory(np.zeros((4, 3), np.float32), ACTION)
+
+
 def test_a_reward_too_large_for_float32_is_refused():
     with pytest.raises(ValueError, match=r"reward must be finite .* with 1 of inf; pass None"):
         Trajectory(IMAGE, ACTION, np.array([0, 1e300, 0]))

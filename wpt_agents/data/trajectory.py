@@ -65,9 +65,11 @@ class Trajectory:
             with np.errstate(over="ignore"):  # to infinity, which is refused below
                 reward = np.asarray(reward).astype(np.float32)
         if image.ndim != 4 or image.shape[-1] != 3 or image.dtype != np.uint8:
-            remedy = "; np.rint(255 * image).astype(np.uint8) if 1 is white"
-            if image.dtype == np.uint8:
-                remedy = "; image.transpose(0, 2, 3, 1)" if image.shape[1:2] == (3,) else ""
+            remedy = ""
+            if image.ndim == 4 and image.dtype.kind == "f":
+                remedy = "; np.rint(255 * image).astype(np.uint8) if 1 is white"
+            elif image.ndim == 4 and image.shape[1] == 3:
+                remedy = "; image.transpose(0, 2, 3, 1)"
             raise ValueError(
                 f"Trajectory.image must be (T + 1, H, W, 3) uint8, got {image.shape} {image.dtype}"
                 f"{remedy}"

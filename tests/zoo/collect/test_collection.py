@@ -105,6 +105,16 @@ def test_the_stored_actions_lead_to_the_stored_images(tmp_path):
     assert np.array_equal(replayed.image, stored.image)
 
 
+def test_one_task_needs_no_list(tmp_path):
+    data = collect(tmp_path / "data", DOT, 1, workers=1, progress_bar=False)
+    assert data.tasks == [DOT]
+
+
+def test_tasks_of_discrete_actions_are_refused_with_the_line_that_converts_them(tmp_path):
+    with pytest.raises(ValueError, match=r"takes Discrete\(2\): wrap it so that"):
+        collect(tmp_path / "data", "CartPole-v1", 1, workers=1, progress_bar=False)
+
+
 class Careless(gym.Wrapper):
     """Draws every image into the same array, and scales actions in place."""
 

@@ -51,7 +51,7 @@ Result = TypeVar("Result")
 
 def collect(
     path: str | os.PathLike[str],
-    tasks: Sequence[str],
+    tasks: str | Sequence[str],
     episodes: int,
     seed: int = 0,
     workers: int = 2,
@@ -71,7 +71,7 @@ def collect(
     under `if __name__ == "__main__":`.
 
     :param path: a folder; a finished collection is returned unchanged, an unfinished one continued
-    :param tasks: ids for `gymnasium.make`
+    :param tasks: ids for `gymnasium.make`, or one of them
     :param episodes: number of episodes of each task
     :param seed: seed of the episodes
     :param workers: number of processes
@@ -89,6 +89,7 @@ def collect(
     :param settings: keywords of WPT for a curious agent, in addition to `curious.EXPLORE`; `steps`
         of "explore-state"
     """
+    tasks = [tasks] if isinstance(tasks, str) else list(tasks)
     _check(tasks, episodes, behaviour, policy)
     _check_options(behaviour, sigmas, settings or {})
     _check_settings(behaviour, settings or {})

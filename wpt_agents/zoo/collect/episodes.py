@@ -15,6 +15,7 @@ import wpt_envs
 from gymnasium import spaces
 
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.training.spaces import check_actions
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 from wpt_agents.zoo.collect.state_curiosity import STAGES, by_state, stage_files, state_policy
@@ -99,6 +100,7 @@ def make_env(task: str, recipe: Recipe) -> gym.Env:
     needs_state = needs_state or (recipe.policy is not None and sees_states(recipe.policy))
     needs_state = needs_state or recipe.stages is not None
     env = gym.make(task, **{**recipe.env, **({"state_in_info": True} if needs_state else {})})
+    check_actions(env.action_space, max_action_dim=None)
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return env

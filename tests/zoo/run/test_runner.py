@@ -13,6 +13,7 @@ import toy_env
 import yaml
 from debug_agent import recorded
 from dot_runs import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
+from gymnasium import spaces
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from wpt_envs.tasks import TASKS
@@ -20,6 +21,7 @@ from wpt_envs.tasks import TASKS
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.learner import Learner
+from wpt_agents.zoo.judge import evaluation
 from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
 from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
 from wpt_agents.zoo.plan.methods import METHODS
@@ -301,6 +303,18 @@ def test_doing_nothing_earns_the_first_reward_at_every_step():
         DoNothing(env.action_space), DOT.id, {"action_repeat": 1, "rendering": "fast"}, 1, 5
     )
     assert list(score.returns) == [pytest.approx(steps * env.reward(), rel=1e-5)]
+
+
+@pytest.mark.parametrize("parallel", [2, 5])
+def test_an_evaluation_of_many_episodes_plays_them_in_turns(parallel, monkeypatch):
+    made = []
+    whole = evaluate(DoNothing(spaces.Box(-1, 1, (2,))), DOT.id, {}, 5, 7)
+    monkeypatch.setattr(evaluation, "PARALLEL", parallel)
+    monkeypatch.setattr(
+        evaluation, "make_vec_env", lambda *rest: made.append(rest[-1]) or make_vec_env(*rest)
+    )
+    assert evaluate(DoNothing(spaces.Box(-1, 1, (2,))), DOT.id, {}, 5, 7) == whole
+    assert len(set(whole.returns)) > 1 and made == ([2, 2, 1] if parallel == 2 else [5])
 
 
 def test_evaluations_and_training_start_from_different_seeds(tmp_path):

@@ -22,6 +22,7 @@ from wpt_agents.zoo.terminal import progress
 
 Wrap = Callable[[VecEnv], VecEnv]
 
+PARALLEL = 50  # simulators at once in an evaluation, to bound the memory
 EPISODE = 2  # distinguishes these seeds from those of `plan.runs.EVALUATION`
 
 
@@ -97,19 +98,16 @@ def evaluate(
     label: str = "",
     wrap: Wrap | None = None,
 ) -> Score:
-    """Play `episodes` episodes in parallel, each with its own seed.
+    """Play `episodes` episodes, up to `PARALLEL` at once, each with its own seed.
 
     Policies that are evaluated with the same `seed` start from the same initial states.
 
     :param wrap: the wrapper that the policy needs around its environments
     """
+    returns: list[float] = []
     successes: list[bool] = []
-    venv = make_vec_env(task, env, seed, episodes)
     steps = episode_steps(task, env)
-    with (
-        closing(wrap(venv) if wrap else venv) as wrapped,
-        progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar,
-    ):
+    with progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar:
 
         def watch(local: dict[str, Any], _: dict[str, Any]) -> None:
             bar.update(1)
@@ -117,10 +115,15 @@ def evaluate(
             if local["done"] and "is_success" in info:
                 successes.append(bool(info["is_success"]))
 
-        returns, _ = evaluate_policy(
-            policy, wrapped, episodes, callback=watch, return_episode_rewards=True
-        )
-    return Score(tuple(np.asarray(returns, float).tolist()), tuple(successes))
+        for first in range(0, episodes, PARALLEL):
+            number = min(PARALLEL, episodes - first)
+            venv = make_vec_env(task, env, seed + first, number)
+            with closing(wrap(venv) if wrap else venv) as wrapped:
+                earned, _ = evaluate_policy(
+                    policy, wrapped, number, callback=watch, return_episode_rewards=True
+                )
+            returns += np.asarray(earned, float).tolist()
+    return Score(tuple(returns), tuple(successes))
 
 
 def acting(policy: PolicyPredictor) -> Act:

@@ -37,6 +37,9 @@ pytestmark = pytest.mark.slow  # it runs simulators or whole runs
         (["run", "--preset", "debug", "--device", "gpu"], "write auto, cpu, cuda"),
         (["run", "--preset", "debug", "--device", "gpu", "--engine", "local"], "write auto, cpu"),
         (["pretrain", "--preset", "debug", "--device", "cuda:99"], "--device cuda:99: torch"),
+        (["run", "--preset", "debug", "--cpus", "4"], "--cpus has no effect with --engine none"),
+        (["run", "--preset", "debug", "--engine", "local", "--gpus", "1"], "take ray or slurm"),
+        (["run", "--preset", "debug", "--engine", "slurm", "--gpus", "0.5"], "whole GPUs"),
     ],
 )
 def test_a_wrong_name_ends_in_the_nearest_valid_one_and_code_2(

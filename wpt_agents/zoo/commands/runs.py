@@ -66,7 +66,7 @@ Engine = Annotated[
 Cpus = Annotated[int, typer.Option(min=1, help="CPU cores to reserve for each run of an engine.")]
 Gpus = Annotated[
     float,
-    typer.Option(min=0, help="GPUs to reserve for each run of an engine; with Ray also 0.5."),
+    typer.Option(min=0, help="GPUs to reserve for each run on Ray and Slurm; with Ray also 0.5."),
 ]
 Memory = Annotated[
     float, typer.Option(min=0, help="GB of memory to reserve for each run on Ray and Slurm.")
@@ -79,7 +79,11 @@ Hours = Annotated[
 ]
 Retries = Annotated[
     int,
-    typer.Option(min=0, help="The number of times a run is resumed after its worker was killed."),
+    typer.Option(
+        min=0,
+        help="The number of times a run is resumed after its worker was killed (engines local and "
+        "ray).",
+    ),
 ]
 Address = Annotated[
     str, typer.Option(help="The address of a Ray cluster; by default one is started here.")
@@ -208,7 +212,7 @@ def run_benchmark(
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import make_sequences
-    from wpt_agents.zoo.run.dispatch import do_plan, do_sequences, preview
+    from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
 
@@ -217,6 +221,9 @@ def run_benchmark(
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     if from_nothing and load_preset(suite, preset).pretrain.model:
         changes.append("pretrain.model=")
+    limits = cpus, gpus, memory_gb, hours, retries
+    resources = Resources(workers, *limits, address, partition)
+    check_resources(engine, resources)
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
@@ -232,6 +239,5 @@ def run_benchmark(
     if dry_run:
         preview(runs, engine, force)
         return
-    limits = cpus, gpus, memory_gb, hours, retries
-    if not do_plan(runs, engine, force, Resources(workers, *limits, address, partition)):
+    if not do_plan(runs, engine, force, resources):
         raise typer.Exit(1)

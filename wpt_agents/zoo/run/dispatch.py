@@ -1,10 +1,12 @@
 """Show a plan, or check and execute it, here or on an engine."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import typer
 
-from wpt_agents.zoo.machine import check_machine, choose_threads
+from wpt_agents.files.names import unknown_name
+from wpt_agents.zoo.machine import ENGINES, check_machine, choose_threads
 from wpt_agents.zoo.plan.estimate import check_space, summary
 from wpt_agents.zoo.plan.overview import show_plan
 from wpt_agents.zoo.plan.runs import Run
@@ -13,6 +15,33 @@ from wpt_agents.zoo.run.engines import Resources, run_on
 from wpt_agents.zoo.run.folder import check_folder
 from wpt_agents.zoo.run.runner import run_all
 from wpt_agents.zoo.run.sequences import check_sequence, run_sequences
+
+ENGINES_OF = {  # the engines that use each resource
+    "cpus": ("local", "ray", "slurm"),
+    "gpus": ("ray", "slurm"),
+    "memory_gb": ("ray", "slurm"),
+    "hours": ("slurm",),
+    "retries": ("local", "ray"),
+    "address": ("ray",),
+    "partition": ("slurm",),
+}
+
+
+def check_resources(engine: str, resources: Resources) -> None:
+    """Raise an error for resources that the engine does not reserve."""
+    if engine not in ENGINES:
+        raise unknown_name("engine", engine, ENGINES)
+    usual = asdict(Resources())
+    for name, value in asdict(resources).items():
+        engines = ENGINES_OF.get(name, (engine,))
+        if value != usual[name] and engine not in engines:
+            option = f"--{name.replace('_', '-')}"
+            raise ValueError(
+                f"{option} has no effect with --engine {engine}: leave it out, or take "
+                f"{' or '.join(engines)}"
+            )
+    if engine == "slurm" and resources.gpus % 1:
+        raise ValueError(f"--gpus {resources.gpus}: Slurm reserves whole GPUs, only Ray shares one")
 
 
 def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:

@@ -12,7 +12,7 @@ from run_folders import make_run
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import aggregates, figures, headline
 from wpt_agents.zoo.report.aggregates import misprint, references
-from wpt_agents.zoo.report.folders import read_results
+from wpt_agents.zoo.report.folders import find_finished, read_results
 from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.report.paper_tables import Cell, TableRow, shared_note, without_notes
 
@@ -296,6 +296,16 @@ def test_a_table_whose_tasks_were_not_run_has_no_mean(tmp_path):
     assert text(re.search(r"<td>mean</td>.*?</tr>", table, re.S)[0]).startswith(" mean – ")
 
 
+def test_evaluations_without_successes_are_not_drawn_as_success_rates(tmp_path):
+    folder = make_run(tmp_path, "metaworld-reach", returns=(9.0, 1.0))
+    [run] = find_finished(tmp_path)
+    assert run.evaluations()[1].max() == 1
+    with np.load(folder / "evaluations.npz") as stored:
+        arrays = {name: stored[name] for name in stored if name != "successes"}
+    np.savez(folder / "evaluations.npz", **arrays)
+    assert run.evaluations() is None
+
+
 def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):
     words = text(page)
     assert "Figure 2: six tasks, all methods" in words
@@ -304,6 +314,8 @@ def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):
     assert f"dmc-walker-run: {lacking}" in words
     figure = page[page.index('id="figure-2"') : page.index('id="table-')]
     assert figure.count("<svg") == 1 and "metaworld-reach" not in figure
+    key = re.search(r'<div class="key">.*?</div>', figure, re.S)[0]
+    assert text(key).split() == ["wpt", "scratch"]
     make_run(tmp_path / "other", "metaworld-reach", 0, "wpt", (9.0, 1.0))
     write_page(tmp_path / "other", tmp_path / "other.html")
     assert "Figure 2" not in text((tmp_path / "other.html").read_text())

@@ -24,10 +24,14 @@ class Figure2:
     """The figure, as complete as the runs allow.
 
     :param curves: SVG, one for each task
+    :param names: of the curves' experiments
+    :param all_names: of all experiments of the page, for the colours
     :param missing: a line for each task that lacks methods
     """
 
     curves: Sequence[str]
+    names: Sequence[str]
+    all_names: Sequence[str]
     missing: Sequence[str]
 
 
@@ -47,4 +51,5 @@ def figure_2(runs: Sequence[Finished], names: Names) -> Figure2 | None:
             missing.append(
                 f"{task}: no run of {counted(len(lacking), 'method')}, {', '.join(lacking)}"
             )
-    return Figure2(curves, missing)
+    drawn_names = {names(run.experiment) for run in runs if run.result.task in FIGURE_2}
+    return Figure2(curves, [n for n in names.all if n in drawn_names], names.all, missing)

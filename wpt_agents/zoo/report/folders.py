@@ -53,8 +53,9 @@ class Finished:
         stored = Evaluations.read(self.folder / EVALUATIONS)
         if stored is None:
             return None
-        counted = stored.successes if self.result.metric == "success" else None
-        scores = stored.returns if counted is None else counted
+        scores = stored.successes if self.result.metric == "success" else stored.returns
+        if scores is None:  # returns would be drawn as success rates
+            return None
         repeat = self.result.frames / self.result.steps
         return stored.steps * repeat, np.asarray(scores, float)
 

@@ -46,6 +46,13 @@ def test_the_examples_of_the_help_are_understood(name):
         command.make_context(name, words)  # raises on what it does not understand
 
 
+@pytest.mark.parametrize("words", ["--tasks a b --set c=1 d=2", "--tasks=a b --set=c=1 d=2"])
+def test_an_option_takes_several_values_however_the_first_is_written(words):
+    context = COMMANDS["run"].make_context("run", shlex.split(words))
+    assert list(context.params["tasks"]) == ["a", "b"]
+    assert list(context.params["settings"]) == ["c=1", "d=2"]
+
+
 def fail(error):
     def load(*_, **__):
         raise error

@@ -121,6 +121,7 @@ def test_a_moved_out_is_not_done_again(tmp_path):
         (["enjoy", "empty"], "holds no model.zip"),
         (["eval", "alone.zip"], "add --task"),
         (["eval", "run", "--task", "dmc-walker-rum"], "Did you mean 'walker-run'"),
+        (["eval", "run", "--task", "dmc-walker-*"], "matches 7 tasks: name one"),
         (["enjoy", "run", "--size", "100"], "multiple of 16"),
         (["enjoy", "run", "--out", "film.avi"], "end in .mp4 or .gif"),
         (["eval", "damaged"], "is not the configuration of a run"),

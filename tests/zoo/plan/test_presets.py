@@ -113,7 +113,7 @@ def test_seeds_are_how_many_or_which(text, seeds):
     assert parse_seeds(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["", "0", "x", "1-", "3-1"])
+@pytest.mark.parametrize("text", ["", "0", "x", "1-", "3-1", "0,3-1", "1-2-3"])
 def test_seeds_that_are_none_are_refused(text):
     with pytest.raises(ValueError, match="how many"):
         parse_seeds(text)

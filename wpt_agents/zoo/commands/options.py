@@ -19,8 +19,9 @@ class Spaced(TyperCommand):
         has_value = False
         for arg in args:
             if arg.startswith("-"):
-                option = arg if arg in several else None
-                has_value = False
+                name, equals, _ = arg.partition("=")  # `--tasks a` or `--tasks=a`
+                option = name if name in several else None
+                has_value = bool(equals)
             elif option and has_value:
                 words.append(option)
             else:

@@ -18,7 +18,8 @@ RunFolder = Annotated[
 ForTask = Annotated[
     str,
     typer.Option(
-        help="The task, e.g. `dmc-walker-run`; required for a file outside its run folder."
+        help="The task, e.g. `dmc-walker-run`; required for a file outside its run folder, which "
+        "is played with the default rendering and action repeat."
     ),
 ]
 

@@ -108,7 +108,10 @@ def find_trained(path: Path, task: str = "") -> Trained:
     if origin is None and not task:
         raise ValueError(f"{folder} has no config.yaml to say what {model.name} is for: add --task")
     origin = origin or Origin("")
-    name = find_tasks("dmc", [task])[0].id if task else origin.task
+    rows = find_tasks("dmc", [task]) if task else []
+    if len(rows) > 1:
+        raise ValueError(f"--task {task} matches {len(rows)} tasks: name one as `list` shows it")
+    name = rows[0].id if rows else origin.task
     if name not in TASKS:
         raise unknown_name("task", name, TASKS)
     return Trained(model, name, origin.env, find_method(origin.method))

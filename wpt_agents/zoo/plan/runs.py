@@ -168,8 +168,9 @@ def parse_seeds(text: str) -> list[int]:
         if text.strip().isdigit():
             seeds = list(range(int(text)))
         else:
-            ends = [part.split("-") for part in text.split(",")]
-            seeds = [s for e in ends for s in range(int(e[0]), int(e[-1]) + 1)]
+            parts = [part.partition("-") for part in text.split(",")]
+            ranges = [range(int(a), int(b if dash else a) + 1) for a, dash, b in parts]
+            seeds = [seed for part in ranges for seed in part] if all(ranges) else []
     except ValueError:
         seeds = []
     if not seeds:

@@ -5,11 +5,14 @@ from collections import namedtuple
 from dataclasses import replace
 
 import pytest
+from debug_agent import recorded
 from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 from run_folders import make_run
 from zoo_command import call
 
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.plan.estimate import check_space, disk_needed, gigabytes, hours_needed, summary
+from wpt_agents.zoo.plan.overview import show_plan
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -20,6 +23,20 @@ def test_the_dataset_and_two_models_a_run_are_counted(tmp_path):
     assert disk_needed(scratch) == (2 * 2 + 2) * 2_400_000 + 75 * 12_288
     # 4 episodes of one task, counted as 1,000 steps
     assert disk_needed([job(tmp_path)]) - disk_needed(scratch[:1]) == 4 * 1000 * 2_500
+
+
+def test_a_plan_counts_the_episodes_that_a_dataset_lacks(tmp_path, capsys):
+    one = job(tmp_path)
+    whole = disk_needed([one])
+    with TrajectoryDataset.create(one.shared.data_path) as dataset:
+        dataset.append(recorded())
+    assert whole - disk_needed([one]) == 1000 * 2_500
+    show_plan([one], force=False)
+    assert "dataset      3 episodes to collect" in capsys.readouterr().out
+    with TrajectoryDataset.open(one.shared.data_path) as dataset:
+        dataset.extend(recorded() for _ in range(3))
+    show_plan([one], force=False)
+    assert "dataset      exists" in capsys.readouterr().out
 
 
 def test_no_room_is_told_before_any_work(tmp_path, monkeypatch, capsys):

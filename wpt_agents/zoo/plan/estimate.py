@@ -23,10 +23,10 @@ def disk_needed(jobs: Sequence[Run]) -> int:
     left = [job for job in jobs if read_result(job.folder) is None]
     data = {job.shared.data_path: job.shared for job in left if job.algorithm.needs_data}
     total = 0
-    for path, shared in data.items():
-        if not path.exists():
-            steps = 1000 // shared.preset.env.action_repeat  # assumes the longest episodes
-            total += shared.preset.collect.episodes * len(shared.tasks) * steps * STORED_STEP
+    for shared in data.values():
+        missing = 0 if shared.given_data is not None else shared.episodes - shared.stored
+        steps = 1000 // shared.preset.env.action_repeat  # assumes the longest episodes
+        total += max(missing, 0) * steps * STORED_STEP
     models = [model_bytes(job) for job in left]
     replay = max((job.preset.steps * RAW_STEP for job in left), default=0)
     checkpoints = 2 * max(models, default=0)  # only the current run has them

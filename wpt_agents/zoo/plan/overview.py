@@ -25,8 +25,8 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
     console.print(table)
     datasets = {job.shared.data_path: job.shared for job in jobs if job.algorithm.needs_data}
     for path, shared in datasets.items():
-        episodes = counted(shared.preset.collect.episodes * len(shared.tasks), "episode")
-        state = "exists" if path.exists() else f"{episodes} to collect"
+        missing = 0 if shared.given_data is not None else shared.episodes - shared.stored
+        state = f"{counted(missing, 'episode')} to collect" if missing > 0 else "exists"
         console.print(f"dataset      {state}  {dim(path)}")
     models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
     for path, shared in models.items():

@@ -73,6 +73,19 @@ class Shared:
         return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
 
     @property
+    def episodes(self) -> int:
+        """The number of episodes of the preset's dataset."""
+        return len(self.tasks) * self.preset.collect.episodes
+
+    @property
+    def stored(self) -> int:
+        """The number of episodes that are collected already; 0 if the dataset cannot be read."""
+        try:
+            return TrajectoryDataset.open(self.data_path).appended
+        except (OSError, ValueError):
+            return 0
+
+    @property
     def shipped(self) -> str:
         """The model of the library that replaces pre-training, or "": they are all WPT's."""
         return self.preset.pretrain.model if self.agent is WPT else ""

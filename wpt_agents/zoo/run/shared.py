@@ -41,13 +41,8 @@ def collect_data(shared: Shared) -> TrajectoryDataset:
 
 def _collected(shared: Shared) -> TrajectoryDataset:
     settings = shared.preset.collect
-    total = len(shared.tasks) * settings.episodes
-    try:
-        stored = (
-            TrajectoryDataset.open(shared.data_path).appended if shared.data_path.exists() else 0
-        )
-    except ValueError:
-        stored = 0  # `collect` raises the error
+    total = shared.episodes
+    stored = shared.stored  # 0 for a damaged dataset, for which `collect` raises the error
     state = "reused" if stored == total else f"continued at {stored} of" if stored else "making"
     names = ", ".join(settings.tasks) or f"all tasks of {shared.suite}"
     episodes = counted(total, "reward-free episode")

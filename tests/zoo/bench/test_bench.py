@@ -175,7 +175,12 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
 
     monkeypatch.setattr("wpt_agents.zoo.commands.bench.importlib.import_module", missing)
     ran = CliRunner().invoke(app, ["bench", "data"])
-    assert isinstance(ran.exception, ValueError) and "h5py" in str(ran.exception)
+    assert isinstance(ran.exception, ValueError)
+    assert str(ran.exception).endswith(
+        'h5py, which is not installed: pip install "wpt-agents[all]"'
+    )
+    ran = CliRunner().invoke(app, ["bench", "model", "--peer", "sheeprl"])
+    assert str(ran.exception).endswith('pip install "wpt-agents[peers]"')
     ran = CliRunner().invoke(app, ["bench", "--quick"])
     assert ran.exit_code == 0 and "bench data is left out: it needs h5py" in ran.stderr
 

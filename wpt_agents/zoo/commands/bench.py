@@ -132,8 +132,10 @@ def bench(
                 module.plot(measured, plot)
         except ImportError as error:
             if case != Case.all:
+                extra = "peers" if peer else "all"
                 raise ValueError(
-                    f"bench {name} needs {error.name}, which is not installed"
+                    f"bench {name} needs {error.name}, which is not installed: "
+                    f'pip install "wpt-agents[{extra}]"'
                 ) from error
             typer.echo(f"bench {name} is left out: it needs {error.name}.", err=True)
 

@@ -668,6 +668,21 @@ def test_tdmpc2_actions_lead_to_the_observation_and_are_shifted_back(tmp_path):
         check(episode, expected)
 
 
+def test_a_first_action_of_tdmpc2_that_is_no_placeholder_is_asked_about(tmp_path):
+    import torch
+
+    old = chain(5)
+    content = {"obs": torch.from_numpy(old.image[None, :-1])}
+    content["action"] = torch.from_numpy(old.action[None])
+    torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(ValueError, match=r"a\.pt episode 0: .*pass shifted=True if it did"):
+        open_episodes(tmp_path / "a.pt", "tdmpc2", **SMALL)[0]
+    check(open_episodes(tmp_path / "a.pt", "tdmpc2", shifted=False, **SMALL)[0], old, 5)
+    content["obs"] = torch.from_numpy(old.image[None])  # an image more than actions
+    torch.save(content, tmp_path / "a.pt")
+    check(open_episodes(tmp_path / "a.pt", "tdmpc2", **SMALL)[0], old)
+
+
 def test_a_pickle_of_tdmpc2_is_loaded_by_those_who_trust_it_only(tmp_path):
     save_tdmpc2(tmp_path / "chunk_0.pt", [chain(5)], pickled=True)
     with pytest.raises(ValueError, match=r"pickle of more than tensors .*trust=True \(--trust\)"):

@@ -19,6 +19,7 @@ import numpy as np
 
 from wpt_agents.data.importers.episodes import Episodes, warn_left_out
 from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, first, natural
+from wpt_agents.data.importers.rows import between_images
 from wpt_agents.data.importers.tables import TableEpisodes
 from wpt_agents.data.trajectory import Trajectory
 
@@ -95,14 +96,14 @@ class NpzEpisodes(Episodes):
         arrays = arrays_of(file, keys)
         key = self._check(file, arrays)
         images = len(arrays[key])
-        led_to = self._led_to(file, arrays, images)
-        taken = slice(1, None) if led_to else slice(images - 1)
+        actions = [arrays[name] for name in self._action_keys]
+        taken = between_images(actions, images, self._shifted, str(file))
         # dm_env marks a terminal state by a discount of 0, and a time limit by 1
         over = arrays.get("is_terminal", 1 - arrays.get("discount", np.ones(1)))
         if self.done_key is not None:
             over = arrays[self.done_key]
         # Where the last action is dropped, what it led to is not seen.
-        seen = led_to or len(arrays[self._action_keys[0]]) < images
+        seen = taken.start == 1 or len(actions[0]) < images
         return self._trajectory(
             arrays[key],
             self._actions(arrays, taken),
@@ -111,22 +112,6 @@ class NpzEpisodes(Episodes):
             terminated=seen and bool(np.ravel(over)[-1] == 1),
             **self._labels(file),
         )
-
-    def _led_to(self, file: Path, arrays: dict[str, np.ndarray], images: int) -> bool:
-        """Return whether each action led to the image of its row.
-
-        :raises ValueError: if the first action should be a placeholder but is not
-        """
-        actions = [arrays[name] for name in self._action_keys]
-        if len(actions[0]) < images:
-            return False
-        if self._shifted is None and any(np.nan_to_num(action[0]).any() for action in actions):
-            raise ValueError(
-                f"{file}: in this format the action of a row led to its image, and the first "
-                "action of an episode is zero, but here it is not: pass shifted=True if it did "
-                "(--shifted), or shifted=False if the action was taken at the image (--no-shifted)"
-            )
-        return self._shifted is not False
 
     def _actions(self, arrays: dict[str, np.ndarray], taken: slice) -> np.ndarray:
         """Return the actions between the images; several arrays are concatenated."""

@@ -184,6 +184,28 @@ def _led_to(table: Table, empty: bool) -> bool:
     return empty and mark is not None
 
 
+def between_images(
+    actions: Sequence[np.ndarray], images: int, shifted: bool | None, name: str
+) -> slice:
+    """Return the rows of the actions between the images of an episode whose actions led to images.
+
+    Row t holds the action that led to image t, and the first one is a placeholder, unless there is
+    an action fewer than images, or the user has decided otherwise.
+
+    :param shifted: what the user has decided, if anything
+    :raises ValueError: if the first action should be a placeholder but is not
+    """
+    if len(actions[0]) < images:
+        return slice(0, images - 1)
+    if shifted is None and any(np.nan_to_num(np.asarray(action[0])).any() for action in actions):
+        raise ValueError(
+            f"{name}: in this format the action of a row led to its image, and the first action of "
+            "an episode is zero or NaN, but here it is not: pass shifted=True if it did "
+            "(--shifted), or shifted=False if the action was taken at the image (--no-shifted)"
+        )
+    return slice(0, images - 1) if shifted is False else slice(1, None)
+
+
 def read_actions(table: Table, columns: Keys, start: int, stop: int) -> np.ndarray:
     """Return the actions of some rows, (stop - start, A); several arrays are concatenated."""
     if len(columns.actions) == 1:

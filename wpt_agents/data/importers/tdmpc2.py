@@ -15,6 +15,7 @@ import torch
 
 from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.keys import ACTIONS, IMAGES, REWARDS, first, natural
+from wpt_agents.data.importers.rows import between_images
 from wpt_agents.data.trajectory import Trajectory
 
 
@@ -23,11 +24,20 @@ class TdMpc2Episodes(Episodes):
 
     :param file: a file, or a folder of them
     :param trust: load a file that is a pickle, which can run any code
+    :param shifted: whether row t holds the action that led to observation t, as by default,
+        instead of the one that was taken at it
     :param options: those of `Episodes`
     """
 
-    def __init__(self, file: str | os.PathLike[str], trust: bool = False, **options: Any) -> None:
+    def __init__(
+        self,
+        file: str | os.PathLike[str],
+        trust: bool = False,
+        shifted: bool | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__(**options)
+        self._shifted = shifted
         self._refuse_done_key("TD-MPC2")
         path = Path(file)
         self._root = path
@@ -82,10 +92,13 @@ class TdMpc2Episodes(Episodes):
     def __getitem__(self, i: int) -> Trajectory:
         file, row = self._places[i]
         images, actions, rewards = self._find(file)
-        parts = [np.asarray(action[row][1:]) for action in actions]
+        image = np.asarray(images[row])
+        source = f"{file.name} episode {row}"
+        parts = [np.asarray(action[row]) for action in actions]
+        taken = between_images(parts, len(image), self._shifted, source)
         return self._trajectory(
-            np.asarray(images[row]),
-            np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1),
-            None if rewards is None else np.ravel(np.asarray(rewards[row]))[1:],
-            source=f"{file.name} episode {row}",
+            image,
+            np.concatenate([part[taken].reshape(len(part[taken]), -1) for part in parts], axis=1),
+            None if rewards is None else np.ravel(np.asarray(rewards[row]))[taken],
+            source=source,
         )

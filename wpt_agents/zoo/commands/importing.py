@@ -48,8 +48,9 @@ Shifted = Annotated[
     bool | None,
     typer.Option(
         "--shifted/--no-shifted",
-        help="For hdf5, npz and zarr: the action of a row led to its observation (--shifted, as in "
-        "dm_env), or was taken at it (--no-shifted). By default the format decides.",
+        help="For hdf5, npz, tdmpc2 and zarr: the action of a row led to its observation "
+        "(--shifted, as in dm_env), or was taken at it (--no-shifted). By default the format "
+        "decides.",
     ),
 ]
 Camera = Annotated[

@@ -2,7 +2,7 @@
 
 import shutil
 from collections import namedtuple
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from debug_agent import recorded
@@ -11,7 +11,16 @@ from run_folders import make_run
 from zoo_command import call
 
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.plan.estimate import check_space, disk_needed, gigabytes, hours_needed, summary
+from wpt_agents.model.sizes import SIZES
+from wpt_agents.zoo.plan.estimate import (
+    LARGEST,
+    check_space,
+    disk_needed,
+    gigabytes,
+    hours_needed,
+    parameters,
+    summary,
+)
 from wpt_agents.zoo.plan.overview import show_plan
 
 Usage = namedtuple("Usage", "total used free")
@@ -37,6 +46,13 @@ def test_a_plan_counts_the_episodes_that_a_dataset_lacks(tmp_path, capsys):
         dataset.extend(recorded() for _ in range(3))
     show_plan([one], force=False)
     assert "dataset      exists" in capsys.readouterr().out
+
+
+def test_networks_of_ones_own_widths_count_as_the_next_larger_ones():
+    assert parameters(SIZES["debug"]) == parameters("debug") == 0.2e6
+    wider = {**asdict(SIZES["debug"]), "deter": 72}
+    assert parameters(wider) == parameters("tiny")
+    assert parameters({**wider, "deter": 20_000}) == LARGEST == parameters("paper")
 
 
 def test_no_room_is_told_before_any_work(tmp_path, monkeypatch, capsys):

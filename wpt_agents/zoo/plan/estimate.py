@@ -1,11 +1,13 @@
 """Estimates of the time and the disk space that a plan needs, before it begins."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from wpt_agents.files.names import counted
+from wpt_agents.model.sizes import SIZES, Size, find_size
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
@@ -15,6 +17,7 @@ RAW_STEP = 12_288  # bytes of an image in the replay
 PARAMETERS = {"debug": 0.2e6, "tiny": 0.8e6, "small": 3e6, "mid": 6e6, "medium": 18e6}
 PARAMETERS |= {"none": 6e6}  # for agents without sizes: DrQ-v2 as published
 LARGEST = 300e6  # parameters of the size "paper"
+WIDTHS = ("deter", "hidden", "stoch", "classes", "depth", "units")  # fields of `Size`
 WEIGHT = 12  # bytes per parameter in a model file: its value and the optimiser's two averages
 
 
@@ -35,9 +38,24 @@ def disk_needed(jobs: Sequence[Run]) -> int:
 
 def model_bytes(job: Run) -> int:
     """Return the approximate size of a run's model file."""
-    size = job.full_keywords.get("size", "none")
-    known = PARAMETERS.get(size, LARGEST) if isinstance(size, str) else LARGEST
-    return int(known * WEIGHT)
+    return int(parameters(job.full_keywords.get("size", "none")) * WEIGHT)
+
+
+def parameters(size: str | Size | Mapping[str, Any]) -> float:
+    """Return about how many parameters networks of this size have.
+
+    For widths of one's own, it is the number of the next larger size that has a name.
+    """
+    if isinstance(size, str):
+        return PARAMETERS.get(size, LARGEST)
+    widths = [getattr(find_size(size), name) for name in WIDTHS]
+    larger = [
+        PARAMETERS[name]
+        for name, known in SIZES.items()
+        if name in PARAMETERS
+        and all(getattr(known, w) >= width for w, width in zip(WIDTHS, widths, strict=True))
+    ]
+    return min(larger, default=LARGEST)
 
 
 def check_space(jobs: Sequence[Run]) -> None:

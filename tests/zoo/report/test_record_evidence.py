@@ -1,7 +1,9 @@
 """The pages beside a record: the evidence of each task, the pairs, and the picture."""
 
+import time
 from itertools import pairwise
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from typer.testing import CliRunner
@@ -163,6 +165,28 @@ def test_pages_are_renewed_without_run_folders(tmp_path):
     assert ran.exit_code == 0, ran.output
     assert path.read_bytes() == before and path.with_suffix(".png").stat().st_size > 1000
     assert path.with_suffix(".md").read_text() == record_page.markdown(record.read(path))
+
+
+def test_two_processes_that_record_at_once_lose_no_line(tmp_path, monkeypatch):
+    def read_slowly(path):
+        lines = read(path)
+        time.sleep(0.2)
+        return lines
+
+    read = record.read
+    monkeypatch.setattr(record, "read", read_slowly)
+    monkeypatch.setattr(record_picture, "draw", lambda *_: None)
+    path = tmp_path / "mid.csv"
+    record.update(path, LINES[:1])
+    threads = [Thread(target=record_page.update, args=(path, [one])) for one in LINES[1:4]]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    lines = read(path)
+    assert set(lines) == set(LINES[:4])
+    assert path.with_suffix(".md").read_text() == record_page.markdown(lines)
+    assert {file.name for file in tmp_path.iterdir()} == {"mid.csv", "mid.md"}
 
 
 def test_a_record_that_does_not_exist_or_is_empty_needs_runs(tmp_path):

@@ -79,8 +79,7 @@ def report(
     parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
     as_markdown = "\n".join([*parts, *([sequence_markdown(sequences)] if sequences else [])])
     if record is not None and results:
-        lines = records.update(record, records.lines_of(find_finished(folder)))
-        record_page.write(record, lines)
+        record_page.update(record, records.lines_of(find_finished(folder)))
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:

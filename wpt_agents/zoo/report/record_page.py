@@ -1,11 +1,19 @@
 """The pages beside a record: `results.md` and `results.png` of `results.csv`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.report import evidence, pairs, record_picture, record_tables
+from wpt_agents.zoo.report import record as records
 from wpt_agents.zoo.report.record import Line
+from wpt_agents.zoo.run.locks import locked_folder
+
+
+def update(record: Path, lines: Iterable[Line]) -> None:
+    """Add lines to a record and write its pages; several processes take turns."""
+    with locked_folder(record.parent):
+        write(record, records.update(record, lines))
 
 
 def write(record: Path, lines: Sequence[Line]) -> None:

@@ -129,6 +129,20 @@ def test_data_that_are_set_later_take_the_place_of_those_that_were_chosen(datase
     assert {t.reward[0] for t in model.retrieved.trajectories} == {2.0}
 
 
+def test_data_whose_reading_was_interrupted_are_read_again_and_whole(dataset, monkeypatch):
+    model = agent(ClockEnv(), dataset())
+
+    def interrupted(trajectories, box):
+        yield next(iter(trajectories))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("wpt_agents.agents.frame_agent.in_units_of", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(7)
+    assert len(model.learn(7).retrieved.trajectories) == 4
+
+
 def test_the_number_of_trajectories_is_fixed_once_they_are_chosen(dataset, tmp_path):
     data = dataset()
     model = agent(ClockEnv(), data).learn(7)

@@ -142,12 +142,11 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         if self.progress.retrieved_of != self.dataset.fingerprint:
             self.progress.retrieved_ids = self._related()
             self.progress.retrieved_of = self.dataset.fingerprint
-        self.retrieved = ReplayBuffer()
+        retrieved = ReplayBuffer()
         chosen = self.dataset.subset(self.progress.retrieved_ids)
         read = in_units_of(chosen, self.action_space)
         for trajectory in shown(read, len(chosen), "retrieve", progress_bar):
             if self.offline_rewards and trajectory.reward is None:
-                self.retrieved = None
                 raise ValueError(
                     f"The dataset {self.dataset.path} holds trajectories without rewards, which "
                     "label='true' needs: pass label='zero' or label='optimistic'"
@@ -155,7 +154,8 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             if not self.offline_rewards:
                 # Another task may end elsewhere, so terminations count as little as rewards do.
                 trajectory = replace(trajectory, reward=None, terminated=False)
-            self.retrieved.add(trajectory)
+            retrieved.add(trajectory)
+        self.retrieved = retrieved  # all of them, or none if reading was interrupted
 
     @property
     def chosen(self) -> bool:

@@ -1,7 +1,10 @@
-"""The policies of the model-free agents as SB3's own files hold them."""
+"""The policies of the model-free agents as SB3's own files hold them, and who uses a dataset."""
+
+import warnings
 
 import numpy as np
 import pytest
+from debug_agent import recorded
 from toy_env import DotEnv
 
 from wpt_agents import JSRL, MRQ, R3M, RLPD, DrQv2, PackNet
@@ -32,3 +35,15 @@ def test_a_policy_of_other_widths_is_saved_and_loaded(agent, widths, tmp_path):
     np.testing.assert_array_equal(
         loaded.predict(image, deterministic=True)[0], policy.predict(image, deterministic=True)[0]
     )
+
+
+@pytest.mark.parametrize(
+    ("agent", "uses"),
+    [(DrQv2, False), (MRQ, False), (PackNet, False), (JSRL, True), (R3M, True), (RLPD, True)],
+)
+def test_a_dataset_that_an_agent_has_no_use_for_is_reported(agent, uses):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        agent("CnnPolicy", DotEnv(), dataset=[recorded()], **NARROW)
+    said = [w.filename for w in caught if "dataset= has no effect" in str(w.message)]
+    assert said == ([] if uses else [__file__])

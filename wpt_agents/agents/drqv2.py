@@ -254,6 +254,7 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": DrQv2Policy}
     saved_as = "DrQv2"
+    uses_data = False
     policy: DrQv2Policy
     learner: DrQv2Learner
     hyperparameters: DrQv2Keywords

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -83,6 +83,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     hyperparameters: FrameKeywords
     progress: FrameProgress
     retrieved: ReplayBuffer | None = None
+    uses_data: ClassVar[bool] = True  # whether there is any use for the keyword `dataset`
 
     def make_policy(self) -> Any:
         """Make the networks, as wide as the environment's actions."""
@@ -142,6 +143,12 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         if self.progress.retrieved_of != self.dataset.fingerprint:
             self.progress.retrieved_ids = self._related()
             self.progress.retrieved_of = self.dataset.fingerprint
+        if dataset is not None and not self.uses_data:
+            warnings.warn(
+                f"{type(self).__name__} learns from its environment alone, so dataset= has no "
+                "effect: leave it out, or take RLPD or JSRL, which use offline data",
+                stacklevel=3,
+            )
         retrieved = ReplayBuffer()
         chosen = self.dataset.subset(self.progress.retrieved_ids)
         read = in_units_of(chosen, self.action_space)

@@ -72,6 +72,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
     """
 
     saved_as = "JSRL"
+    uses_data = True
     hyperparameters: JSRLKeywords
     shape_keywords = (*DrQv2.shape_keywords, "bc_size")
 

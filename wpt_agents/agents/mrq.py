@@ -199,6 +199,7 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": MRQPolicy}
     saved_as = "MRQ"
+    uses_data = False
     policy: MRQPolicy
     learner: MRQLearner
     hyperparameters: MRQKeywords

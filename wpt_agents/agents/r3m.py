@@ -161,6 +161,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": R3MPolicy}
     saved_as = "R3M"
+    uses_data = True
     policy: R3MPolicy
     learner: R3MLearner
     hyperparameters: R3MKeywords

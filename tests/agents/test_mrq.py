@@ -23,6 +23,10 @@ SETTINGS = {
 }
 
 
+class Stop(BaseException):
+    """What Ctrl-C is."""
+
+
 def agent(env=None, **changes):
     return MRQ("CnnPolicy", env, **SETTINGS | changes)
 
@@ -48,6 +52,16 @@ def test_targets_are_copied_and_rewards_measured_every_few_updates():
     assert not same(weights(model, "actor"), renamed(model, "target_actor", "actor"))
     model.learn(7, reset_num_timesteps=False)
     assert model.updates == 5 and model.progress.target_scale == 4.0
+
+
+def test_an_interrupted_update_of_the_encoder_leaves_the_scales_alone(monkeypatch):
+    model = agent(ClockEnv(), train_freq="episode", learning_starts=0, update_every=7)
+    with monkeypatch.context() as patch:
+        patch.setattr(model.learner, "update_encoder", lambda *_: (_ for _ in ()).throw(Stop))
+        with pytest.raises(Stop):
+            model.learn(7)
+    model.learn(7, reset_num_timesteps=False)
+    assert (model.progress.scale, model.progress.target_scale) == (4.0, 1.0)
 
 
 def test_the_encoder_learns_first_in_every_task():

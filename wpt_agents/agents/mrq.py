@@ -234,14 +234,15 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
         trajectories = self.replay_buffer.trajectories
         rewards = np.concatenate([t.reward for t in trajectories if t.reward is not None])
         self.learner.copy_targets()
-        self.progress.target_scale = self.progress.scale
-        self.progress.scale = max(float(np.abs(rewards).mean()), LEAST_SCALE)
         ends = any(trajectory.terminated for trajectory in trajectories)
         losses = []
         for number in range(settings.sync_every):
             rng = self.batch_rng(1 + number)
             shape = settings.batch_size, settings.horizon, self.policy.action_dim
             batch = draw_steps(trajectories, *shape, rng, settings.pad).to(self.device)
+        # Last, so that it happens once even if the updates above are interrupted and made again.
+        self.progress.target_scale = self.progress.scale
+        self.progress.scale = max(float(np.abs(rewards).mean()), LEAST_SCALE)
             losses.append(self.learner.update_encoder(batch, ends))
         return torch.stack(losses).mean()
 

@@ -80,6 +80,27 @@ def test_predict_is_the_mean_action_or_noisy_and_in_the_environments_bounds():
     np.testing.assert_allclose(one, 2 * (mean + 1), rtol=1e-5)
 
 
+def test_predict_has_the_noise_of_the_present_step_before_anything_is_learned():
+    model = agent(ClockEnv(), std=0.0)
+    image = ClockEnv().reset()[0]
+
+    def noisy():
+        actions = [model.predict(image, deterministic=choice)[0] for choice in (True, False)]
+        return (actions[0] != actions[1]).any()
+
+    assert not noisy()
+    model.std = 0.5
+    assert noisy()
+
+
+def test_a_state_that_is_none_of_its_own_is_refused():
+    model = agent(ClockEnv())
+    image = ClockEnv().reset()[0]
+    for state in ((), (image,), image):
+        with pytest.raises(ValueError, match="pass the state that this model's own predict"):
+            model.predict(image, state)
+
+
 def test_sb3_evaluates_it_and_callbacks_see_and_stop_it():
     class Stop(BaseCallback):
         def _on_step(self):

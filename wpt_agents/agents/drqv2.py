@@ -272,15 +272,6 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
         """σ of the exploration schedule at the present step."""
         return parse_schedule(self.hyperparameters.std, np.inf, "std")(self.num_timesteps)
 
-    def restore(self, *args: Any) -> None:
-        """Take over a model file, and the noise of the step that it was written at."""
-        super().restore(*args)
-        self.policy.std = self.std_now
-
-    def before_step(self) -> None:
-        """Explore with the noise that the schedule has for this step."""
-        self.policy.std = self.std_now
-
     def update(self, metrics: Metrics) -> None:
         """Make one update on transitions of the replay buffer."""
         settings = self.hyperparameters

@@ -87,7 +87,9 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     def make_policy(self) -> Any:
         """Make the networks, as wide as the environment's actions."""
-        return self.policy_class(self.observation_space, self.action_space, **self.widths())
+        policy = self.policy_class(self.observation_space, self.action_space, **self.widths())
+        policy.std = self.std_now
+        return policy
 
     def widths(self) -> dict[str, Any]:
         """Return the keywords of the policy's constructor, from those of the agent."""
@@ -101,6 +103,20 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     def updates_per_step(self) -> float:
         """How many updates are made for each collected step."""
         return 1 / self.hyperparameters.update_every
+
+    @property
+    def std_now(self) -> float:
+        """σ of the noise that is added to actions at the present step, 0 if there is none."""
+        return 0.0
+
+    def before_step(self) -> None:
+        """Explore with the noise of this step."""
+        self.policy.std = self.std_now
+
+    def restore(self, *args: Any) -> None:
+        """Take over a model file, and the noise of the step that it was written at."""
+        super().restore(*args)
+        self.policy.std = self.std_now
 
     @property
     def offline_rewards(self) -> bool:
@@ -127,6 +143,12 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     def set_dataset(self, dataset: Data | None) -> None:
         """Use another dataset; the next call of `learn` chooses the offline data from it."""
+        if dataset is not None and not self.uses_data:
+            warnings.warn(
+                f"{type(self).__name__} learns from its environment alone, so dataset= has no "
+                "effect: leave it out, or take RLPD or JSRL, which use offline data",
+                stacklevel=3,
+            )
         super().set_dataset(dataset)
         if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
             self.retrieved = None
@@ -143,12 +165,6 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         if self.progress.retrieved_of != self.dataset.fingerprint:
             self.progress.retrieved_ids = self._related()
             self.progress.retrieved_of = self.dataset.fingerprint
-        if dataset is not None and not self.uses_data:
-            warnings.warn(
-                f"{type(self).__name__} learns from its environment alone, so dataset= has no "
-                "effect: leave it out, or take RLPD or JSRL, which use offline data",
-                stacklevel=3,
-            )
         retrieved = ReplayBuffer()
         chosen = self.dataset.subset(self.progress.retrieved_ids)
         read = in_units_of(chosen, self.action_space)
@@ -219,8 +235,9 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
 
     def hyperparameters_changed(self) -> None:
-        """Hand the keywords to the learner, and the learning rate to its optimisers."""
+        """Hand the keywords to learner and policy, and the learning rate to the optimisers."""
         self.learner.settings = self.hyperparameters
+        self.policy.std = self.std_now
         for optimizer in optimizers(self.learner).values():
             for group in optimizer.param_groups:
                 group["lr"] = self.hyperparameters.learning_rate

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -206,15 +206,14 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
     progress: MRQProgress
     shape_keywords: ClassVar[tuple[str, ...]] = ("channels", "latent_dim", "hidden_dim")
 
-    def make_policy(self) -> Any:
-        """Make the networks, and set the noise that the policy explores with."""
-        policy = super().make_policy()
-        policy.std = self.hyperparameters.std
-        return policy
-
     def make_learner(self) -> MRQLearner:
         """Make the optimisers."""
         return MRQLearner(self.policy, self.hyperparameters)
+
+    @property
+    def std_now(self) -> float:
+        """σ of the noise on actions, which is the same at all steps."""
+        return self.hyperparameters.std
 
     def update(self, metrics: Metrics) -> None:
         """Make one update on the replay. Once in `sync_every` updates, the encoder's come first."""
@@ -240,17 +239,16 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
             rng = self.batch_rng(1 + number)
             shape = settings.batch_size, settings.horizon, self.policy.action_dim
             batch = draw_steps(trajectories, *shape, rng, settings.pad).to(self.device)
+            losses.append(self.learner.update_encoder(batch, ends))
         # Last, so that it happens once even if the updates above are interrupted and made again.
         self.progress.target_scale = self.progress.scale
         self.progress.scale = max(float(np.abs(rewards).mean()), LEAST_SCALE)
-            losses.append(self.learner.update_encoder(batch, ends))
         return torch.stack(losses).mean()
 
     def hyperparameters_changed(self) -> None:
         """Hand the keywords to learner and policy, and the rates to the optimisers."""
         super().hyperparameters_changed()
         settings = self.hyperparameters
-        self.policy.std = settings.std
         for group in self.learner.encoder_optimizer.param_groups:
             group["lr"] = settings.encoder_learning_rate
         for optimizer in optimizers(self.learner).values():

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import IMAGE_SIZE
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.observations import State, stack_frames
+from wpt_agents.model.observations import State, check_state, stack_frames
 from wpt_agents.model.pixel_policy import PixelPolicy
 from wpt_agents.model.sizes import Size
 
@@ -96,12 +96,9 @@ class FramePolicy(PixelPolicy):
         :param generator: of the noise; torch's own if None
         :return: action (n, A) in [-1, 1], and the new state
         """
-        if state is not None and len(state[0]) != len(image):
-            raise ValueError(
-                f"The state is of {len(state[0])} environments, the observation of {len(image)}: "
-                "pass state=None where all episodes begin"
-            )
-        frames = stack_frames(image, state[0] if state else None, episode_start)
+        if state is not None:
+            check_state(state, ((FRAMES, *image.shape[1:]),), len(image))
+        frames = stack_frames(image, None if state is None else state[0], episode_start)
         action = self.decide(torch.from_numpy(frames).to(self.device), deterministic, generator)
         if not action.isfinite().all():
             raise ValueError("The actor's output is not finite: the weights are damaged")

@@ -5,8 +5,10 @@ import pytest
 from debug_agent import ClockEnv, recorded, same, weights
 from toy_env import DotEnv
 
+from wpt_agents.agents import jsrl
 from wpt_agents.agents.jsrl import HORIZONS, JSRL
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.cloning import clone
 
 SETTINGS = {
     "channels": 2,
@@ -68,8 +70,16 @@ def test_the_clone_drives_exactly_the_first_steps_and_they_are_learned_from(
         np.testing.assert_array_equal(episode.action[step], action)
 
 
-def test_the_clone_learns_from_the_robots_trajectories_and_is_offered_as_prior(dataset):
-    model = agent(dataset)
+def test_the_clone_learns_from_the_robots_trajectories_and_is_offered_as_prior(
+    dataset, monkeypatch
+):
+    model, cloned = agent(dataset), []
+
+    def recorded_clone(actor, trajectories, *args):
+        cloned.extend(trajectories)
+        return clone(actor, trajectories, *args)
+
+    monkeypatch.setattr(jsrl, "clone", recorded_clone)
     assert model.prior is None
     before = weights(model, "prior_actor")
     model.learn(60)
@@ -77,7 +87,8 @@ def test_the_clone_learns_from_the_robots_trajectories_and_is_offered_as_prior(d
     assert not same(before, weights(model, "prior_actor"))
     action, _ = model.prior.predict(DotEnv().reset(seed=0)[0])
     assert action.shape == (2,)
-    assert all(t.reward is None for t in model.retrieved.trajectories)
+    assert len(cloned) == 3 and all(t.reward is None for t in cloned)
+    assert model.retrieved is None  # nothing else is learned from them
     for name in ("bc_steps", "num_retrieve"):
         with pytest.raises(ValueError, match=r"the clone is trained; call reset_task\(\) first"):
             setattr(model, name, 2)

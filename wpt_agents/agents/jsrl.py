@@ -105,6 +105,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         )
         self.policy.prior_actor.load_state_dict(trained.state_dict())
         self.progress.cloned = True
+        self.retrieved = None  # gigabytes of images, which nothing reads any more
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""

@@ -679,6 +679,15 @@ def test_another_task_of_a_sequence_is_drawn_by_the_seed_and_keeps_the_world_mod
     assert same(kept, {k: before[k] for k in kept})
 
 
+def test_a_next_task_that_is_refused_leaves_the_present_one_as_it_was():
+    model = agent(DotEnv(), offline_ratio=0, guidance=0).learn(LENGTH)
+    before = weights(model)
+    with pytest.raises(ValueError, match="at most max_action_dim=4"):
+        model.next_task(DotEnv(actions=5))
+    assert len(model.replay_buffer) == model.num_timesteps == LENGTH
+    assert same(before, weights(model))
+
+
 def test_episodes_are_kept_only_beside_a_dataset():
     model = agent(DotEnv(), offline_ratio=0, guidance=0)
     with pytest.raises(ValueError, match="keep_data=True keeps episodes beside a dataset"):

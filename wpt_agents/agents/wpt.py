@@ -342,11 +342,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         begin again.
 
         :param env: the environment of the next task, in any form that `set_env` takes
+        :raises ValueError: an environment that the agent cannot act in; nothing is discarded then
         """
+        checked = self._checked(env)
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)
         self.num_timesteps = 0
-        self.set_env(env)
+        self._use_env(checked)
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""

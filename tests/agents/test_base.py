@@ -203,6 +203,15 @@ def test_parameters_are_loaded_in_place_from_a_file(tmp_path):
         mean(width=4).set_parameters(str(tmp_path / "mean"))
 
 
+def test_agents_that_begin_with_the_same_parameters_share_no_averages():
+    one, other = mean().learn(28), mean()
+    averages = one.learner.optimizer.state[one.policy.mean]["momentum_buffer"]
+    before = averages.clone()
+    other.set_parameters(one.get_parameters())
+    other.learn(28)
+    assert torch.equal(averages, before)
+
+
 def test_an_agent_without_an_environment_says_that_it_needs_one():
     with pytest.raises(ValueError, match="Mean needs an environment: pass env="):
         Mean("MeanPolicy")

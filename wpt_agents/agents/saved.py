@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -296,7 +297,8 @@ class SavedAgent(KeywordAgent):
         """Load weights and optimisers in place, from a model file or from `get_parameters`."""
         if isinstance(load_path_or_dict, dict):
             self.fit_networks(load_path_or_dict.get("policy", {}))
-            super().set_parameters(load_path_or_dict, exact_match, device)
+            # A copy, as torch lets two optimisers share the averages that one hands to the other.
+            super().set_parameters(deepcopy(load_path_or_dict), exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         self._check_same(header, self.shape_keywords)

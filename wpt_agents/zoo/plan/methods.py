@@ -99,7 +99,7 @@ class Method:
         """Return the agent's keywords.
 
         :param wpt: the preset's section `wpt`
-        :param own: the keywords of the agent's own sections
+        :param specific: the keywords of the agent's own sections
         """
         kept = {k: v for k, v in wpt.items() if self.shared is None or k in self.shared}
         return {**kept, **specific, **self.keywords}

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -140,6 +141,48 @@ def test_another_action_width_begins_a_new_sequence(tmp_path):
         one.learn(25, reset_num_timesteps=False)
         one.next_task(ClockEnv(25, actions=5))
     assert model.progress == loaded.progress and same(weights(model), weights(loaded))
+
+
+def test_a_task_whose_end_failed_goes_on_and_can_be_ended_again(tmp_path, monkeypatch):
+    model = agent(ClockEnv(25)).learn(25)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "replay.zip")
+    loaded = PackNet.load(tmp_path / "model", env=ClockEnv(25), device="cpu")
+    with pytest.raises(ValueError, match=r"load_replay_buffer\(\) first, or set model.retrain = 0"):
+        loaded.next_task(ClockEnv(25))
+    loaded.load_replay_buffer(tmp_path / "replay.zip")
+    update = PackNet.update
+
+    def interrupted(self, metrics):
+        update(self, metrics)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PackNet, "update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            loaded.next_task(ClockEnv(25))
+    assert loaded.progress == model.progress and same(weights(model), weights(loaded))
+    for one in (model, loaded):
+        one.next_task(ClockEnv(25))
+        one.learn(25)
+    assert loaded.progress == model.progress and same(weights(model), weights(loaded))
+
+
+@pytest.mark.parametrize("by_file", [True, False])
+def test_parameters_of_another_task_are_loaded_in_place(by_file, tmp_path):
+    first = agent(ClockEnv(25)).learn(25)
+    later = agent(ClockEnv(25)).learn(25)
+    later.next_task(ClockEnv(25))
+    later.learn(25)
+    for source, target in ((later, agent(ClockEnv(25))), (first, later)):
+        source.save(tmp_path / "model")
+        target.set_parameters(tmp_path / "model" if by_file else source.get_parameters())
+        assert target.progress.task == source.progress.task
+        target.updates = source.updates
+        target.replay_buffer = source.replay_buffer
+        for one in (source, target):
+            one.update(defaultdict(list))
+        assert same(weights(source), weights(target))
 
 
 def test_freed_weights_are_drawn_again():

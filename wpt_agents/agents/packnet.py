@@ -71,11 +71,11 @@ class PackNetPolicy(DrQv2Policy):
         """The task that owns each weight of a layer, or FREE."""
         return self.get_buffer(_owner(name))
 
-    def freeze_rest(self) -> None:
-        """Freeze the biases and layer norms of encoder and actor."""
+    def freeze_rest(self, frozen: bool = True) -> None:
+        """Freeze the biases and layer norms of encoder and actor, or let them learn."""
         managed = {id(weight) for _, weight in self.managed()}
         for parameter in (*self.encoder.parameters(), *self.actor.parameters()):
-            parameter.requires_grad_(id(parameter) in managed)
+            parameter.requires_grad_(id(parameter) in managed or not frozen)
 
     @torch.no_grad()
     def prune(self, task: int, tasks_left: int) -> None:
@@ -168,7 +168,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         model.learn(150_000)
         model.next_task("wpt/dmc-quadruped-walk-v0")
         model.learn(150_000)
-        model.policy_of(0).predict(obs)  # still stands
+        model.policy_of(0).predict(obs, deterministic=True)  # still stands
 
     :param policy: "CnnPolicy"
     """
@@ -184,13 +184,13 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         """Make the optimisers, and mask the gradients of weights that earlier tasks own."""
         return PackNetLearner(self.policy, self.hyperparameters)
 
-    def restore(self, contents: Mapping[str, Any], *args: Any) -> None:
-        """Take over a model file; in a later task biases and layer norms are frozen."""
-        # before the weights are read: the optimisers must hold the parameters that the file's have
-        if contents["counters"]["task"]:
-            self.policy.freeze_rest()
+    def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
+        """Go to the task that these weights are of; from the second on, the rest is frozen."""
+        owners = [owner for name, owner in weights.items() if name.startswith(_owner(""))]
+        if owners:
+            self.progress.task = 1 + max(int(owner.max()) for owner in owners)
+            self.policy.freeze_rest(self.progress.task > 0)
             self.learner = self.make_learner()  # its optimisers leave out what is frozen
-        super().restore(contents, *args)
 
     def policy_of(self, task: int) -> PackNetPolicy:
         """Return the policy of a task up to the present one, as it was when the task ended.
@@ -216,7 +216,8 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         The collected episodes are discarded, since another task has other rewards. The schedules
         begin again.
 
-        :raises ValueError: the sequence has no further task, or the actions have another width
+        :raises ValueError: the sequence has no further task, the actions have another width, or
+            the episodes to retrain on are missing; the present task goes on then
         """
         tasks_left = self.hyperparameters.tasks - 1 - self.progress.task
         if tasks_left < 1:
@@ -227,9 +228,15 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
                 f"The tasks of a sequence have actions of one width, here {self.action_space.shape}"
                 f" and {checked.action_space.shape}"
             )
-        self.policy.prune(self.progress.task, tasks_left)
-        self.policy.freeze_rest()
-        self._retrain(progress_bar)
+        before = self.policy, self.learner, self.updates
+        self.policy = deepcopy(self.policy)
+        try:
+            self.policy.prune(self.progress.task, tasks_left)
+            self.policy.freeze_rest()
+            self._retrain(progress_bar)
+        except BaseException:  # the task goes on as if it had not been ended
+            self.policy, self.learner, self.updates = before
+            raise
         with self.streams.weights(Purpose.REDRAW, self.progress.task, self.device):
             self.policy.redraw()
         self.replay_buffer = ReplayBuffer()
@@ -245,5 +252,10 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self.learner = PackNetLearner(self.policy, self.hyperparameters, self.progress.task)
         made = self.updates - self.progress.updates_before
         updates = round(made * self.hyperparameters.retrain)
+        if updates and not self.replay_buffer.trajectories:
+            raise ValueError(
+                "The weights that the task keeps are trained on its episodes, and there are none: "
+                "call load_replay_buffer() first, or set model.retrain = 0"
+            )
         for _ in shown(range(updates), updates, "retrain", progress_bar):
             self.update(defaultdict(list))

@@ -87,7 +87,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     def make_policy(self) -> Any:
         """Make the networks, as wide as the environment's actions."""
-        policy = self.policy_class(self.observation_space, self.action_space, **self.widths())
+        policy: Any = self.policy_class(self.observation_space, self.action_space, **self.widths())
         policy.std = self.std_now
         return policy
 

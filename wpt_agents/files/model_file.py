@@ -62,6 +62,15 @@ def read_model(
         return _read(file, str(path))
 
 
+def agent_of(path: str | os.PathLike[str]) -> str | None:
+    """Return the class that wrote a model file; None if the file is none, as `read_model` tells."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return str(json.loads(archive.read(ABOUT))["class"])
+    except FAULTS:
+        return None
+
+
 def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     try:
         with zipfile.ZipFile(file) as archive:

@@ -84,8 +84,8 @@ def collect(
     :param rewards: store the rewards, too
     :param sigmas: standard deviations of the Gaussian noise on scripted and saved policies, which
         the episodes use in turn
-    :param policy: a WPT model file, or one of SB3's as "sac:expert.zip". It takes images, or the
-        simulator's state if it was trained on states
+    :param policy: a model file of WPT or a baseline, or one of SB3's as "sac:expert.zip". It takes
+        images, or the simulator's state if it was trained on states
     :param settings: keywords of WPT for a curious agent, in addition to `curious.EXPLORE`; `steps`
         of "explore-state"
     """

@@ -1,4 +1,4 @@
-"""Saved policies as behaviours: models of WPT or Stable-Baselines3, with noise."""
+"""Saved policies as behaviours: models of this library or Stable-Baselines3, with noise."""
 
 from functools import cache
 from pathlib import Path
@@ -8,18 +8,28 @@ import numpy as np
 import stable_baselines3 as sb3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.agents.drqv2 import DrQv2
+from wpt_agents.agents.jsrl import JSRL
+from wpt_agents.agents.mrq import MRQ
+from wpt_agents.agents.packnet import PackNet
+from wpt_agents.agents.r3m import R3M
+from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.model_file import agent_of
 from wpt_agents.files.names import unknown_name
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "wpt": WPT,
     **{name: getattr(sb3, name.upper()) for name in ("a2c", "ddpg", "ppo", "sac", "td3")},
 }
+OURS: dict[str, type[BaseAlgorithm]] = {
+    agent.__name__: agent for agent in (WPT, DrQv2, JSRL, MRQ, PackNet, R3M, RLPD)
+}
 
 
 @cache
 def load_policy(name: str) -> BaseAlgorithm:
-    """Load the model in the file `name`: of WPT, or of another algorithm as `sac:expert.zip`.
+    """Load the model in the file `name`: of this library, or of SB3 as `sac:expert.zip`.
 
     SB3's files contain pickles: load only those that you trust.
 
@@ -30,7 +40,8 @@ def load_policy(name: str) -> BaseAlgorithm:
         raise unknown_name("algorithm", algorithm, ALGORITHMS)
     if not Path(path).is_file():
         raise ValueError(f"No policy {path}: pass a model file, or `sac:FILE` for one of SB3's")
-    return ALGORITHMS[algorithm or "wpt"].load(path, device="cpu")
+    kind = ALGORITHMS[algorithm] if algorithm else OURS.get(agent_of(path) or "", WPT)
+    return kind.load(path, device="cpu")
 
 
 def sees_states(name: str) -> bool:

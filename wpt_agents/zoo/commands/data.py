@@ -62,7 +62,8 @@ Sigma = Annotated[
 Policy = Annotated[
     str | None,
     typer.Option(
-        help="The model for `--behaviour policy`: a file of WPT, or of SB3 as `sac:FILE`."
+        help="The model for `--behaviour policy`: a file of WPT or a baseline, or of SB3 as "
+        "`sac:FILE`."
     ),
 ]
 Rewards = Annotated[bool, typer.Option("--rewards", help="Store the rewards, too.")]

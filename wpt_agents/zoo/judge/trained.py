@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import TASKS
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.files.model_file import agent_of
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.judge.evaluation import evaluate, film
 from wpt_agents.zoo.judge.prediction import CONTEXT
@@ -107,7 +108,7 @@ def find_trained(path: Path, task: str = "") -> Trained:
     origin = read_origin(folder)
     if origin is None and not task:
         raise ValueError(f"{folder} has no config.yaml to say what {model.name} is for: add --task")
-    origin = origin or Origin("")
+    origin = origin or Origin("", method=_method_of(model))
     rows = find_tasks("dmc", [task]) if task else []
     if len(rows) > 1:
         raise ValueError(f"--task {task} matches {len(rows)} tasks: name one as `list` shows it")
@@ -134,6 +135,12 @@ class Origin:
     task: str
     env: Mapping[str, Any] = field(default_factory=dict)
     method: str = "wpt"
+
+
+def _method_of(model: Path) -> str:
+    """Return a method whose agent wrote a model file, "wpt" if the file does not say it."""
+    kind = agent_of(model)
+    return next((name for name, row in METHODS.items() if row.agent.__name__ == kind), "wpt")
 
 
 def read_origin(folder: Path) -> Origin | None:

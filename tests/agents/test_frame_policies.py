@@ -1,10 +1,11 @@
-"""The policies of the model-free agents as SB3's own files hold them, and who uses a dataset."""
+"""What all model-free agents must do: files of SB3, several environments, several images."""
 
 import warnings
 
 import numpy as np
 import pytest
-from debug_agent import recorded
+from debug_agent import ClockEnv, noise, on_time, recorded
+from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import DotEnv
 
 from wpt_agents import JSRL, MRQ, R3M, RLPD, DrQv2, PackNet
@@ -35,6 +36,26 @@ def test_a_policy_of_other_widths_is_saved_and_loaded(agent, widths, tmp_path):
     np.testing.assert_array_equal(
         loaded.predict(image, deterministic=True)[0], policy.predict(image, deterministic=True)[0]
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*without offline data")
+@pytest.mark.parametrize("agent", [kind for kind, _ in AGENTS])
+def test_four_environments_and_then_one_are_learned_from_and_predict_takes_both(agent):
+    few = {"sync_every": 2, "horizon": 2} if agent is MRQ else {}
+    few |= {"batch_size": 4, "learning_starts": 10, "warmup_steps": 10, "update_every": 4}
+    model = agent("CnnPolicy", DummyVecEnv([ClockEnv] * 4), **NARROW, **few).learn(56)
+    made = model.updates
+    model.set_env(ClockEnv())
+    model.learn(14, reset_num_timesteps=False)
+    assert model.episodes == len(model.replay_buffer.trajectories) == 10
+    assert all(on_time(episode) for episode in model.replay_buffer.trajectories)
+    assert 0 < made < model.updates
+    images = noise(4)
+    together, state = model.predict(images, deterministic=True)
+    assert together.shape == (4, 2) and state[0].shape == (4, 3, 64, 64, 3)
+    for image, action in zip(images, together, strict=True):
+        alone, _ = model.predict(image, deterministic=True)
+        np.testing.assert_allclose(alone, action, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -789,6 +789,16 @@ def test_a_lerobot_dataset_of_some_episodes_is_read_with_these_alone(tmp_path):
         open_episodes(tmp_path, episodes=[1, 7])
 
 
+@pytest.mark.filterwarnings("ignore:Images of 32 x 32 are resized")
+def test_a_table_of_lerobot_that_is_missing_is_named_and_can_be_skipped(tmp_path):
+    save_lerobot(tmp_path / "in", [6, 9], video=False)
+    (tmp_path / "in/data/chunk-000/file-001.parquet").unlink()
+    convert = partial(TrajectoryDataset.from_lerobot, tmp_path / "in", tmp_path / "out", **SMALL)
+    with pytest.raises(ValueError, match=r"file-001\.parquet cannot be read.* skip=\[1\]"):
+        convert()
+    assert convert(skip=[1]).lengths.tolist() == [5]
+
+
 def test_an_unknown_robot_of_lerobot_has_no_name(tmp_path):
     save_lerobot(tmp_path, [6], video=False)
     path = tmp_path / "meta/info.json"
@@ -881,6 +891,16 @@ def test_rlds_episodes_keep_to_the_chain_and_the_last_action_means_nothing(tmp_p
     assert new[2].embodiment == "arm"
     assert new[2].source == "1.0.0/chain-train.tfrecord-00001-of-00002 at byte 12"
     assert len(TrajectoryDataset.from_rlds(tmp_path, tmp_path / "out", **SMALL)) == 4
+
+
+def test_files_of_rlds_that_are_missing_are_warned_of(tmp_path):
+    for i in (0, 2):
+        save_rlds(tmp_path / f"1.0.0/a-train.tfrecord-{i:05d}-of-00004", [chain(5, i)])
+    save_rlds(tmp_path / "1.0.0/a-val.tfrecord-00000-of-00001", [chain(5)])
+    words = r"a-train\.tfrecord: 2 of 4 files are missing, number 1 for example"
+    with pytest.warns(UserWarning, match=words) as warned:
+        assert len(open_episodes(tmp_path, **SMALL)) == 3
+    assert len(warned) == 1
 
 
 def test_an_episode_of_no_steps_is_left_out_of_rlds(tmp_path):

@@ -186,10 +186,13 @@ class LeRobotEpisodes(Episodes):
         """Return the episode's rows in order; the file is cached for the next episode."""
         path = self._file(row, "data_path", "data/")
         if self._open is None or self._open[0] != path:
-            names = self._parquet.read_schema(path).names
             usual = ("episode_index", "frame_index", "timestamp", "next.reward")
-            columns = [n for n in names if n in (*usual, *self._actions, self._camera)]
-            self._open = path, self._parquet.read_table(path, columns=columns)
+            try:
+                names = self._parquet.read_schema(path).names
+                columns = [n for n in names if n in (*usual, *self._actions, self._camera)]
+                self._open = path, self._parquet.read_table(path, columns=columns)
+            except OSError as error:
+                raise ValueError(f"{path} cannot be read: {error}") from error
         table = self._open[1]
         # a file holds many episodes
         mine = np.flatnonzero(table["episode_index"].to_numpy() == row["episode_index"])

@@ -7,6 +7,7 @@ action of the last step (`is_last`) is meaningless, so T + 1 steps are T actions
 import os
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,8 @@ class RldsEpisodes(Episodes):
         self._folder = path.parent if path.is_file() else path
         pattern = f"*-{split}.tfrecord*" if split else "*.tfrecord*"
         files = [path] if path.is_file() else sorted(path.rglob(pattern))
+        if path.is_dir():
+            _warn_of_missing(files)
         records = [
             (file, at, size, single) for file in files for at, size, single in find_records(file)
         ]
@@ -139,6 +142,23 @@ class RldsEpisodes(Episodes):
         if key is not None and key not in pictures:
             raise ValueError(f"{source} has no images under {key!r}; {ask}")
         return encoded
+
+
+def _warn_of_missing(files: Sequence[Path]) -> None:
+    """Warn if the names of files, such as a-train.tfrecord-00000-of-00004, say that some lack."""
+    shards: dict[tuple[Path, str, int], set[int]] = {}
+    for file in files:
+        named = re.fullmatch(r"(.*)-(\d{5,})-of-(\d{5,})", file.name)
+        if named:
+            shards.setdefault((file.parent, named[1], int(named[3])), set()).add(int(named[2]))
+    for (folder, name, total), numbers in shards.items():
+        if len(numbers) < total:
+            warnings.warn(
+                f"{folder / name}: {total - len(numbers)} of {total} files are missing, number "
+                f"{min(set(range(total)) - numbers)} for example; the episodes of the others are "
+                "read. Was the download complete?",
+                stacklevel=3,
+            )
 
 
 def _is_picture(data: bytes) -> bool:

@@ -162,14 +162,15 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
 
 
 def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
-    for seed in range(2):
+    for seed in range(3):
         make_run(tmp_path / "runs", "dmc-walker-run", seed, returns=(300.0, 500.0))
     path = tmp_path / "small.csv"
     ran = CliRunner().invoke(app, ["report", str(tmp_path / "runs"), "--record", str(path)])
     assert ran.exit_code == 0, ran.output
-    assert len(record.read(path)) == 8
-    assert "| dmc-walker-run | wpt | debug | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 | 400 |" in (
-        path.with_suffix(".md").read_text()
+    assert len(record.read(path)) == 12
+    assert (
+        "| dmc-walker-run | wpt | debug | 1,000 | 40.0 (40.0 to 40.0) | 40.0 40.0 40.0 | 400 |"
+        in (path.with_suffix(".md").read_text())
     )
     assert path.with_suffix(".png").stat().st_size > 1000
 
@@ -247,3 +248,8 @@ def test_a_method_of_two_budgets_is_drawn_with_both():
         "scratch, 100 frames",
         "scratch, 3,000 frames",
     ]
+
+
+def test_two_seeds_have_no_interval_by_students_t():
+    assert str(record_tables.Cell.of([0.0, 85.0])) == "42.5"
+    assert str(record_tables.Cell.of([40.0, 50.0, 60.0])) == "50.0 (25.2 to 74.8)"

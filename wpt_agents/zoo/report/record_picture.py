@@ -142,9 +142,9 @@ def draw_panels(lines: Sequence[Line]) -> Figure:
         _draw_panel(panel, task.removeprefix(f"{suite}-"), rows)
     for panel in panels.flat[len(tasks) :]:
         panel.remove()
-    figure.supxlabel(
-        "score, 0 to 100\na dot per seed, a stroke at their mean; hollow: the paper's", fontsize=9
-    )
+    explained = "a dot per seed, a stroke at their mean;", "hollow: the paper's"
+    space = " " if columns > 1 else "\n"  # a single panel is narrow
+    figure.supxlabel(f"score, 0 to 100\n{space.join(explained)}", fontsize=9)
     return figure
 
 

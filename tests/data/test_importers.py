@@ -375,6 +375,16 @@ def test_a_folder_of_npz_is_converted_once_and_anew_when_a_file_changes(tmp_path
     assert len(list(cache.iterdir())) == 2
 
 
+def test_a_cache_that_cannot_be_made_is_said_to_be_movable(tmp_path, monkeypatch):
+    save_npz(tmp_path / "in/0.npz", chain(5, 0, size=64))
+    (tmp_path / "file").touch()  # in the place of a folder, which root cannot write into either
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(ValueError, match=r"in is converted into a cache, .* set XDG_CACHE_HOME"):
+        TrajectoryDataset.of(tmp_path / "in")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "folder"))
+    assert len(TrajectoryDataset.of(tmp_path / "in")) == 1
+
+
 def test_a_folder_whose_name_is_a_label_is_converted_again_once_renamed(tmp_path, cache):
     save_npz(tmp_path / "metaworld/reach/20240101T000000-ab-0-5.npz", chain(5, 0, size=64))
     assert TrajectoryDataset.of(tmp_path / "metaworld").tasks == ["reach"]

@@ -193,6 +193,16 @@ def test_groups_with_an_observation_more_than_actions_keep_every_action(tmp_path
         assert episode.terminated
 
 
+def test_a_reward_for_each_image_is_refused_as_it_may_be_shifted(tmp_path):
+    old = chain(5)
+    path = tmp_path / "a.h5"
+    arrays = {"actions": old.action, "observations": old.image, "rewards": np.arange(6.0)}
+    save(path, arrays)
+    assert open_episodes(path, **SMALL)[0].reward is None  # rewards are not asked for
+    with pytest.raises(ValueError, match=r"of shape \(5,\), got \(6,\)"):
+        open_episodes(path, rewards=True, **SMALL)[0]
+
+
 def rows(trajectories, image="observations", action="actions"):
     return {
         image: np.concatenate([t.image[:-1] for t in trajectories]),

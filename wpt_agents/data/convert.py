@@ -139,6 +139,14 @@ def _open_path(source: Source) -> TrajectoryDataset:
     if form is None:
         raise refusal(source, NAMES)
     folder = cache_folder(source)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"{source} is converted into a cache, which cannot be made ({error}): set "
+            "XDG_CACHE_HOME to a folder that can be written to, or convert first by "
+            f"`python -m wpt_agents.zoo import {form} {source} DST`"
+        ) from error
     # Of several processes that start at once, one converts; the others wait and find it done.
     with locked(folder / CONVERT_LOCK):
         return from_episodes(open_episodes(source, form), folder, progress_bar=True)

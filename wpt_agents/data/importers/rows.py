@@ -262,7 +262,7 @@ def whole(
     rows = count(table[columns.actions[0]])
     images = count(table[columns.image])
     if images == rows + 1:
-        reward: Any = None if columns.reward is None else np.asarray(table[columns.reward][:rows])
+        reward: Any = None if columns.reward is None else np.asarray(table[columns.reward][:])
         flags = 0 if columns.terminal is None else count(table[columns.terminal])
         over = _is_flagged(table, columns, flags - 1)  # there may be a flag for each image
         image = [(table[columns.image], 0, images)]

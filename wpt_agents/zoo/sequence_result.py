@@ -70,6 +70,11 @@ class SequenceResult:
         return len(self.rows) == len(self.tasks)
 
     @property
+    def identity(self) -> tuple[str, str, Variant, int, int]:
+        """The identity of the sequence: name, method, variant, budget and seed."""
+        return self.sequence, self.method, self.variant, self.frames, self.seed
+
+    @property
     def command(self) -> str:
         """A command that repeats the runs of the sequence."""
         words = ["python", "-m", "wpt_agents.zoo", "run", "--sequence", self.sequence]

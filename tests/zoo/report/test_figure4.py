@@ -117,3 +117,10 @@ def test_a_task_that_ends_within_its_first_episode_has_an_empty_curve(tmp_path):
     monitor.write_text("#{}\nr,l,t\n", encoding="utf-8")
     [figure] = figures_4(find_sequences(tmp_path))
     assert len(figure.curves) == 1 and figure.matrices[0].rows == [[300.0]]
+
+
+def test_the_same_sequence_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp_path):
+    for copy in ("a", "b"):
+        make_sequence(tmp_path / copy, "wpt", [[800.0]])
+    with pytest.raises(ValueError, match="are the same run: report one of their folders"):
+        find_sequences(tmp_path)

@@ -93,6 +93,14 @@ def test_a_record_of_another_suffix_is_refused_before_anything_is_written(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
+def test_an_unknown_choice_of_media_is_refused_before_anything_is_written(tmp_path):
+    make_run(tmp_path / "runs", "dmc-walker-run")
+    words = ["report", str(tmp_path / "runs"), "--record", str(tmp_path / "a.csv")]
+    ran = CliRunner().invoke(app, [*words, "--media", "frist"])
+    assert "Did you mean 'first'" in str(ran.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
 def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     path = tmp_path / "small.csv"
     first = [line("wpt", 1.5), line("wpt", 2.0, seed=1)]

@@ -30,7 +30,7 @@ from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
-from wpt_agents.zoo.run import learning, runner, shared
+from wpt_agents.zoo.run import evaluating, learning, runner, shared
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.shared import collect_data, pretrain
@@ -231,6 +231,19 @@ def test_a_run_that_failed_is_told_and_done_anew(tmp_path, monkeypatch):
     assert not (job(tmp_path).folder / "result.json").exists()
     assert runner.run_all([job(tmp_path)])
     assert not (job(tmp_path).folder / "error.txt").exists()
+
+
+def test_a_picture_that_cannot_be_drawn_does_not_cost_the_result(tmp_path, monkeypatch, capsys):
+    def no_video(*_):
+        raise OSError("no [ffmpeg] here")
+
+    monkeypatch.setattr(evaluating.pictures, "video", no_video)
+    one = job(tmp_path, "scratch")
+    assert runner.run_all([one])
+    assert "pictures are missing: OSError: no [ffmpeg] here" in capsys.readouterr().out
+    assert read_result(one.folder) is not None and not (one.folder / "error.txt").exists()
+    assert "in no_video" in (one.folder / "pictures.txt").read_text()
+    assert (one.folder / "learning_curve.png").exists()
 
 
 def test_a_forced_run_that_could_not_begin_is_not_finished(tmp_path, capsys):

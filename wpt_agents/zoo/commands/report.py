@@ -56,13 +56,14 @@ def report(
         sequence_table,
     )
     from wpt_agents.zoo.report.folders import find_finished, read_results
-    from wpt_agents.zoo.report.page import write_page
+    from wpt_agents.zoo.report.page import check_media, write_page
     from wpt_agents.zoo.terminal import console
 
     if record is not None and record.suffix != ".csv":
         raise ValueError(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
+    check_media(media)
     results = read_results(folder)
     sequences = figures_4(find_sequences(folder))
     kept = records.read(record) if not results and record is not None and record.exists() else []

@@ -12,6 +12,7 @@ from rich.table import Table
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.report import figures
+from wpt_agents.zoo.report.folders import check_new
 from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.report.tables import markdown_table, number
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
@@ -57,9 +58,18 @@ class Figure4:
 
 
 def find_sequences(folder: Path) -> list[Finished]:
-    """Return every sequence below `folder` with a finished task, in the order of their paths."""
-    results = [(path.parent, read_sequence(path.parent)) for path in folder.glob(f"**/{FILE}")]
-    return sorted((path, result) for path, result in results if result is not None)
+    """Return every sequence below `folder` with a finished task, in the order of their paths.
+
+    :raises ValueError: if a sequence exists twice, which would count as two seeds
+    """
+    finished = []
+    seen: dict[object, Path] = {}
+    for path in sorted(file.parent for file in folder.glob(f"**/{FILE}")):
+        result = read_sequence(path)
+        assert result is not None, path
+        check_new(result.identity, path, seen)
+        finished.append((path, result))
+    return finished
 
 
 def figures_4(finished: Sequence[Finished]) -> list[Figure4]:

@@ -88,14 +88,19 @@ def find_finished(folder: Path) -> list[Finished]:
     for path in sorted(folder.glob(f"**/{FILE}")):
         result = read_result(path.parent)
         assert result is not None, path
-        if result.identity in seen:
-            raise ValueError(
-                f"{seen[result.identity]} and {path.parent} are the same run: report one of their "
-                "folders, or delete one of them"
-            )
-        seen[result.identity] = path.parent
+        check_new(result.identity, path.parent, seen)
         runs.append(Finished(path.parent, result))
     return runs
+
+
+def check_new(identity: object, folder: Path, seen: dict[object, Path]) -> None:
+    """Raise an error if `seen` has a run of this identity; add it otherwise."""
+    if identity in seen:
+        raise ValueError(
+            f"{seen[identity]} and {folder} are the same run: report one of their folders, or "
+            "delete one of them"
+        )
+    seen[identity] = folder
 
 
 def read_results(folder: Path) -> list[Result]:

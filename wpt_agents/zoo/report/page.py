@@ -28,14 +28,19 @@ from wpt_agents.zoo.result import Result, Score, Variant
 MEDIA = ("first", "all", "none")
 
 
+def check_media(media: str) -> None:
+    """Raise an error for an unknown choice of media."""
+    if media not in MEDIA:
+        raise unknown_name("choice of media", media, MEDIA)
+
+
 def write_page(folder: Path, path: Path, media: str = "first") -> None:
     """Write the page about all runs below `folder` to `path` atomically.
 
     :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
         seed of its best-known method), or of "none"; they make up most of the page's size
     """
-    if media not in MEDIA:
-        raise unknown_name("choice of media", media, MEDIA)
+    check_media(media)
     sequences = figure4.find_sequences(folder)
     page = render(find_finished(folder), find_unfinished(folder), media, sequences)
     with replacing(path) as temporary:

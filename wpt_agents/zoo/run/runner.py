@@ -125,11 +125,21 @@ def do_stages(job: Run) -> Result:
     with clock("evaluate"):
         scores = evaluate_policies(job, agent)
     with clock("pictures"):
-        draw(job, agent, scores)
+        try_to_draw(job, agent, scores)
     result = make_result(job, agent, scores, clock.seconds, effort, start)
     write_result(job.folder, result)
     remove_checkpoints(job.folder)
     return result
+
+
+def try_to_draw(job: Run, agent: BaseAlgorithm, scores: Mapping[str, Score]) -> None:
+    """Draw the pictures; if one fails, for example without ffmpeg, the result counts anyway."""
+    try:
+        draw(job, agent, scores)
+    except Exception as error:
+        text = f"pictures are missing: {type(error).__name__}: {error}"
+        say("warning", f"{escape(text)}; the traceback is in pictures.txt")
+        (job.folder / "pictures.txt").write_text(traceback.format_exc(), encoding="utf-8")
 
 
 def prepare_logs(job: Run, checkpoint: Checkpoint | None) -> None:

@@ -96,7 +96,7 @@ def test_a_record_of_another_suffix_is_refused_before_anything_is_written(tmp_pa
 def test_an_unknown_choice_of_media_is_refused_before_anything_is_written(tmp_path):
     make_run(tmp_path / "runs", "dmc-walker-run")
     words = ["report", str(tmp_path / "runs"), "--record", str(tmp_path / "a.csv")]
-    ran = CliRunner().invoke(app, [*words, "--media", "frist"])
+    ran = CliRunner().invoke(app, [*words, "--media", "firsts"])
     assert "Did you mean 'first'" in str(ran.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 

@@ -87,14 +87,14 @@ def test_the_example_runs_as_it_stands(dots, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     settings = {name: value for name, value in SETTINGS.items() if name != "seed"}
     exec(code, left := {"SETTINGS": settings})
-    assert re.search(r"return \d+", capsys.readouterr().out)
+    assert re.search(r"return: mean -?\d+", capsys.readouterr().out)
     assert left["model"].updates == 75 * 0.5 // (2 * 4)  # train_ratio / (B x T)
     assert len(left["model"].retrieved_ids) == 3 and (tmp_path / "drawer.zip").exists()
 
 
 def test_the_readme_is_short():
     assert len(README.split()) <= 900
-    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 26
+    assert len([line for line in EXAMPLE.splitlines() if line.strip()]) <= 18
 
 
 def test_the_readme_uses_public_names_only():
@@ -106,7 +106,8 @@ def test_the_readme_uses_public_names_only():
     ]
     assert modules
     for module, names in modules:
-        assert module == "wpt_agents" and set(names) <= set(wpt_agents.__all__)
+        if not module.startswith("stable_baselines3."):
+            assert module == "wpt_agents" and set(names) <= set(wpt_agents.__all__)
 
 
 def test_ones_own_data_are_stored_as_the_page_says(tmp_path, monkeypatch):

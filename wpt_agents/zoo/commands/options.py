@@ -61,6 +61,7 @@ Workers = Annotated[
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print rows of named cells; cells that a row lacks stay empty."""
+    from rich.markup import escape
     from rich.table import Table
 
     from wpt_agents.zoo.terminal import console
@@ -71,7 +72,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         widest = max(map(len, name.split()))  # words are broken only if there is no room
         table.add_column(name, overflow="fold", min_width=min(widest, 12))
     for row in rows:
-        table.add_row(*(_cell(row.get(key, "")) for key in columns))
+        table.add_row(*(escape(_cell(row.get(key, ""))) for key in columns))
     console.print(table)
 
 

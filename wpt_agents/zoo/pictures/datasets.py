@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from types import SimpleNamespace
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.data.dataset import TrajectoryDataset
@@ -22,7 +23,7 @@ def data_table(dataset: TrajectoryDataset) -> Table:
         groups[robot].append(i)
     rows = {name or "unnamed": dataset.subset(ids) for name, ids in groups.items()}
     for name, part in rows.items():
-        table.add_row(name, *_row(part))
+        table.add_row(escape(name), *_row(part))
     table.add_section()
     table.add_row("all", *_row(dataset))
     return table

@@ -269,11 +269,11 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     """
     needed = run.task.action_dim
     if run.retrieves and needed not in widths:
+        add = "" if run.data is not None else "add such a task to collect.tasks (--set), "
         raise ValueError(
             f"{short_name(run.task)} has {needed} actions, and nothing in the data has as many "
-            f"({', '.join(map(str, sorted(widths)))}): use other --tasks, add such a task to "
-            "collect.tasks (--set), use --data that has one, or use --method scratch or "
-            "pretrain-only"
+            f"({', '.join(map(str, sorted(widths)))}): use other --tasks, {add}use --data that has "
+            "one, or use --method scratch or pretrain-only"
         )
     limit = run.full_keywords.get("max_action_dim")
     widest = max(needed, *widths) if run.algorithm.needs_data else needed

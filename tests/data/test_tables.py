@@ -341,6 +341,16 @@ def resident():
     return pages * resource.getpagesize() / 2**20
 
 
+def test_empty_arrays_and_texts_in_hdf5_do_no_harm(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(5)])
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["data/demo_0/note"] = h5py.Empty("f")
+        file["data/demo_0/obs/words"] = ["lift"] * 5
+        file["data/demo_0/obs/fixed"] = np.array([b"lift"] * 5)
+        file["data/demo_0/scalar"] = 3
+    check(open_episodes(tmp_path / "a.hdf5", **SMALL)[0], chain(5))
+
+
 def test_links_in_hdf5_are_followed_and_a_broken_one_is_named(tmp_path):
     old = [chain(5, 0), chain(7, 1)]
     save_robomimic(tmp_path / "b.hdf5", old)

@@ -54,7 +54,8 @@ class Hdf5Episodes(TableEpisodes):
         except OSError as error:
             raise ValueError(f"{file} is damaged or not an HDF5 file: {error}") from error
         return {
-            name: Array(self._handle, name, array.shape, array.dtype, array.chunks)
+            # an empty array has no shape
+            name: Array(self._handle, name, array.shape or (), array.dtype, array.chunks)
             for name, array in _arrays(self._handle, h5py.Dataset)
         }
 

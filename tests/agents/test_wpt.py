@@ -290,13 +290,14 @@ def test_the_index_is_built_again_when_the_dataset_has_grown(store):
     assert len(model.build_index()) == 7
 
 
-def test_an_index_of_another_encoder_is_refused(store):
+def test_an_index_of_another_encoder_is_built_again(store):
     model = pretrained(store)
     model.build_index()
     [path] = store.path.glob("*.index")
     Retriever(np.zeros((6, 4), np.float32), np.ones(6), [None] * 6, "another").save(path)
-    with pytest.raises(ValueError, match=r"another.*delete the file"):
+    with pytest.warns(UserWarning, match=r"built again: .*the encoder another"):
         model.build_index()
+    assert Retriever.load(path, model.policy.encoder_id()).features.any()
 
 
 def test_a_subset_has_an_index_of_its_own(store):

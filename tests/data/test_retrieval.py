@@ -136,7 +136,7 @@ def test_a_saved_index_answers_the_same(tmp_path):
 
 def test_the_index_of_another_encoder_is_refused_with_the_remedy(tmp_path):
     retriever([[0.0]]).save(tmp_path / "index")
-    with pytest.raises(ValueError, match="encoder e1, this one is e2; delete the file"):
+    with pytest.raises(ValueError, match="encoder e1, not with e2; it needs to be built again"):
         Retriever.load(tmp_path / "index", "e2")
 
 

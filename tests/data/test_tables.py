@@ -66,7 +66,7 @@ def test_the_main_camera_of_robomimic_is_taken_and_another_can_be_named(tmp_path
     old = chain(6)
     cameras = ("robot0_eye_in_hand_image", "agentview_image")
     save_robomimic(tmp_path / "a.hdf5", [old], cameras=cameras)
-    with pytest.warns(UserWarning, match=r"'obs/agentview_image' is taken; .* another: obs/r"):
+    with pytest.warns(UserWarning, match=r"'obs/agentview_image' is used\. .*: obs/robot0"):
         [main] = open_episodes(tmp_path / "a.hdf5", **SMALL)
     np.testing.assert_array_equal(main.image, old.image + 1)
     for key in ("robot0_eye_in_hand_image", "data/demo_0/obs/robot0_eye_in_hand_image"):

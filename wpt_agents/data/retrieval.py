@@ -207,8 +207,8 @@ class Retriever:
         head, arrays = load_arrays(path, "Retriever")
         if head["encoder_id"] != encoder_id:
             raise ValueError(
-                f"{path} was built with the encoder {head['encoder_id']}, this one is "
-                f"{encoder_id}; delete the file and build the index again"
+                f"{path} was built with the encoder {head['encoder_id']}, not with {encoder_id}; "
+                "it needs to be built again"
             )
         labels = arrays["action_dims"], head["embodiments"]
         return cls(arrays["features"], *labels, encoder_id, head.get("dataset_id", ""))

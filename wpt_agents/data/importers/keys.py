@@ -148,7 +148,7 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
     for choice in (cameras, main):
         if len(choice) == 1:
             return choice[0], tuple(name for name in cameras if name != choice[0])
-    raise ValueError(f"the images have no usual name; {ask}")
+    raise ValueError(f"the images have no usual name; {ask}" if pictures else ask)
 
 
 def natural(name: object) -> list[tuple[int, str | int]]:

@@ -155,8 +155,8 @@ class TableEpisodes(Episodes):
         if keys.others and keys.image not in self._chosen:
             self._chosen.add(keys.image)
             warnings.warn(
-                f"{self._root}: of several cameras {keys.image!r} is taken; image_key "
-                f"(--image-key) chooses another: {', '.join(keys.others)}",
+                f"{self._root} has several cameras; {keys.image!r} is used. To use another, pass "
+                f"image_key (--image-key): {', '.join(keys.others)}",
                 stacklevel=4,
             )
 

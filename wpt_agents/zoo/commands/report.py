@@ -1,5 +1,6 @@
 """The command `report`. Imports are inside it so that `--help` answers at once."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +47,6 @@ def report(
     """
     from rich.markup import escape
 
-    from wpt_agents.files.archive import replacing
     from wpt_agents.zoo.report import record as records
     from wpt_agents.zoo.report import record_page, tables
     from wpt_agents.zoo.report.figure4 import (
@@ -88,13 +88,19 @@ def report(
     else:
         page = (out or folder / "report") / "index.html"
         write_page(folder, page, media)
-        beside = {"report.md": as_markdown, "policies.csv": tables.policy_csv(policies)}
-        for name, text in beside.items():
-            with replacing(page.with_name(name)) as temporary:
-                temporary.write_text(text, encoding="utf-8")
+        _write_beside(page, {"report.md": as_markdown, "policies.csv": tables.policy_csv(policies)})
         if rows:
             console.print(tables.summary_table(rows))
         if sequences:
             console.print(sequence_table(sequences))
         where = escape(str(page.resolve()))
         console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")
+
+
+def _write_beside(page: Path, texts: Mapping[str, str]) -> None:
+    """Write files into the folder of the page atomically."""
+    from wpt_agents.files.archive import replacing
+
+    for name, text in texts.items():
+        with replacing(page.with_name(name)) as temporary:
+            temporary.write_text(text, encoding="utf-8")

@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from wpt_agents.fast.products import cpu_model
+
 PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
 
 
@@ -35,12 +37,26 @@ def commit() -> str | None:
     return answer.stdout.strip() or None
 
 
+def cpu() -> str:
+    """Return the processor's name, family and model, as far as the system tells them.
+
+    The name alone is not enough: virtual machines often hide the generation in it.
+    """
+    lines = (line.partition(":") for line in cpu_model().splitlines())
+    found = {key.strip(): value.strip() for key, _, value in lines}
+    if "model name" not in found:
+        return platform.processor()
+    numbers = (f"{key} {found[key]}" for key in ("cpu family", "model") if key in found)
+    return ", ".join((found["model name"], *numbers))
+
+
 def system() -> dict[str, Any]:
     """Return the machine and the versions of a run."""
     return {
         "commit": commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
+        "cpu": cpu(),
         "threads": torch.get_num_threads(),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "versions": {name: version(name) for name in PACKAGES + SIMULATORS},

@@ -43,11 +43,11 @@ def cpu() -> str:
     The name alone is not enough: virtual machines often hide the generation in it.
     """
     lines = (line.partition(":") for line in cpu_model().splitlines())
-    found = {key.strip(): value.strip() for key, _, value in lines}
-    if "model name" not in found:
+    fields = {key.strip(): value.strip() for key, _, value in lines}
+    if "model name" not in fields:
         return platform.processor()
-    numbers = (f"{key} {found[key]}" for key in ("cpu family", "model") if key in found)
-    return ", ".join((found["model name"], *numbers))
+    numbers = (f"{key} {fields[key]}" for key in ("cpu family", "model") if key in fields)
+    return ", ".join((fields["model name"], *numbers))
 
 
 def system() -> dict[str, Any]:

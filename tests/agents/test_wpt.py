@@ -93,6 +93,25 @@ def test_pretraining_teaches_the_world_model_and_nothing_else(store):
     assert end.num_timesteps == end.updates == 0
 
 
+def test_a_new_model_is_adapted_to_its_data_once_and_loaded_weights_never(store, tmp_path):
+    new, twin, off = agent(), agent(), agent(data_dependent_init=False)
+    before = weights(new, "world_model")
+    for model in (new, twin, off):
+        model.adapt_to_data(store)
+    adapted = weights(new, "world_model")
+    changed = {name.split(".")[2] for name in before if (before[name] != adapted[name]).any()}
+    assert changed == {"post_in", "post_out"}
+    assert same(weights(twin, "world_model"), adapted)  # by the seed
+    assert same(weights(off, "world_model"), before)
+    new.save(tmp_path / "model.zip")
+    loaded, by_dict, by_file = WPT.load(tmp_path / "model.zip"), agent(seed=1), agent(seed=1)
+    by_dict.set_parameters(new.get_parameters())
+    by_file.set_parameters(tmp_path / "model.zip")
+    for model in (new, loaded, by_dict, by_file):
+        model.adapt_to_data(store)
+        assert same(weights(model, "world_model"), adapted)
+
+
 def test_pretraining_calls_back_after_every_update_with_finite_metrics(store):
     seen = []
     pretrained(store, steps=3, callback=lambda step, metrics: seen.append((step, metrics)))
@@ -489,6 +508,40 @@ def test_the_average_of_the_actors_since_the_head_start_acts(tmp_path):
     model.policy.average(0)
     with definitions():
         assert np.allclose(model.predict(image, deterministic=True)[0], action, atol=1e-6)
+
+
+@pytest.mark.parametrize(("number", "states"), [(None, 24), (3, 3)])
+def test_dreams_start_from_as_many_states_as_the_keyword_says(number, states, monkeypatch):
+    model, seen = agent(batch_size=4, batch_length=6, imagine_starts=number), []
+    model.replay_buffer.add(recorded(length=20, reward=np.zeros(20)))
+    update_behavior = model.learner.update_behavior
+
+    def noted(start, starts, *args):
+        seen.append((len(start.deter), starts))
+        return update_behavior(start, starts, *args)
+
+    monkeypatch.setattr(model.learner, "update_behavior", noted)
+    model.update(defaultdict(list))
+    [(imagined, starts)] = seen
+    assert imagined == len(starts) == states
+    assert (starts % 6).min() >= (0 if number is None else 2)  # which have seen three images
+
+
+@pytest.mark.parametrize(("share", "newest_only"), [(0.0, False), (1.0, True)])
+def test_online_rows_come_from_the_newest_episodes_by_their_share(share, newest_only, monkeypatch):
+    model, seen = agent(recent_share=share, batch_size=16), []
+    for number in range(12):
+        image = np.full((9, 64, 64, 3), number, np.uint8)
+        model.replay_buffer.add(Trajectory(image, np.zeros((8, 2), np.float32), np.zeros(8)))
+    update = model.learner.update
+
+    def noted(batch, *args):
+        seen.append(batch.image[:, 0, 0, 0, 0].min().item())
+        return update(batch, *args)
+
+    monkeypatch.setattr(model.learner, "update", noted)
+    model.update(defaultdict(list))
+    assert (seen[0] >= 7) is newest_only
 
 
 def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):

@@ -152,6 +152,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         super().restore(header, tensors, same)
         self.let_clone_compete()
 
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Load weights and optimisers in place; a posterior that was loaded is not adapted to data.
+
+        The parameters are those of `SavedAgent.set_parameters`.
+        """
+        super().set_parameters(*args, **kwargs)
+        self.progress.initialised = True
+
     def let_clone_compete(self) -> None:
         """Let the clone take part in acting (`ibrl`, `residual`) if there is one."""
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned

@@ -55,8 +55,10 @@ def report(
         sequence_markdown,
         sequence_table,
     )
-    from wpt_agents.zoo.report.folders import find_finished, read_results
+    from wpt_agents.zoo.report.folders import find_finished
     from wpt_agents.zoo.report.page import check_media, write_page
+    from wpt_agents.zoo.report.steadiness import markdown as steadiness_markdown
+    from wpt_agents.zoo.report.steadiness import steadiness
     from wpt_agents.zoo.terminal import console
 
     if record is not None and record.suffix != ".csv":
@@ -64,7 +66,8 @@ def report(
             f"--record {record}: a record is a .csv; its .md and .png are written beside it"
         )
     check_media(media)
-    results = read_results(folder)
+    runs = find_finished(folder)
+    results = [run.result for run in runs]
     sequences = figures_4(find_sequences(folder))
     kept = records.read(record) if not results and record is not None and record.exists() else []
     if record is not None and kept:
@@ -78,9 +81,10 @@ def report(
     rows = tables.summarise(results)
     policies = tables.policies(results)
     parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
-    as_markdown = "\n".join([*parts, *([sequence_markdown(sequences)] if sequences else [])])
+    parts += [steadiness_markdown(steadiness(runs)), sequence_markdown(sequences)]
+    as_markdown = "\n".join(filter(None, parts))
     if record is not None and results:
-        record_page.update(record, records.lines_of(find_finished(folder)))
+        record_page.update(record, records.lines_of(runs))
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:

@@ -18,6 +18,7 @@ from wpt_agents.zoo.report import (
     headline,
     paper_tables,
     sections,
+    steadiness,
     tables,
 )
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
@@ -79,6 +80,10 @@ def render(
         policy_cells=tables.policy_cells,
         policy_headings=tables.POLICY_HEADINGS,
         policy_note=tables.policy_note,
+        steadiness=steadiness.steadiness(runs),
+        steadiness_cells=steadiness.cells,
+        steadiness_headings=steadiness.HEADINGS,
+        steadiness_considered=steadiness.CONSIDERED,
         runs=[card(run, names, media in illustrated(run, runs)) for run in runs],
         unfinished=unfinished,
         headline=headline.headlines(results),

@@ -193,6 +193,7 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
         ("prediction", ["--steps", "9"]),
         ("work", ["--threads", "2"]),
         ("policy", ["--precision", "bf16"]),
+        ("model", ["--set", "gamma=0.9"]),
     ],
 )
 def test_an_option_without_effect_on_the_case_is_refused(case, option):

@@ -133,6 +133,29 @@ def test_a_montage_puts_each_image_into_its_row_and_column():
     assert (picture[4] == 255).all() and (picture[:, 4] == 255).all()
 
 
+def test_models_of_other_keywords_have_a_folder_of_their_own_and_share_the_data(monkeypatch):
+    collected = []
+
+    def stop(folder, *_, **__):
+        collected.append(folder)
+        raise InterruptedError
+
+    monkeypatch.setattr(bench, "collect", stop)
+    settings = ["data_dependent_init=false", "pixel_weight=8"]
+    for chosen in ([], settings):
+        with pytest.raises(InterruptedError):
+            next(bench.rows(quick=True, settings=chosen))
+    assert collected == [bench.QUICK.folder / "data"] * 2
+    assert bench.changed(bench.QUICK, []) == bench.QUICK
+    plan, other = bench.changed(bench.QUICK, settings), bench.changed(bench.QUICK, settings[:1])
+    changes = {"data_dependent_init": False, "pixel_weight": 8}
+    assert plan.model == bench.QUICK.model | changes and plan.updates == bench.QUICK.updates
+    assert len({bench.QUICK.folder, plan.folder, other.folder}) == 3
+    with pytest.raises(ValueError, match="pixel_weight"):
+        next(bench.rows(quick=True, settings=["pixel_wait=8"]))
+    assert len(collected) == 2
+
+
 @pytest.mark.filterwarnings("ignore:.* holds a model of 2 updates already")  # then an error
 def test_the_command_trains_measures_and_draws_and_then_trains_no_more(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

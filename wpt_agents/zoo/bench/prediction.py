@@ -25,6 +25,8 @@ from wpt_agents.zoo.judge.prediction import (
     windows,
 )
 from wpt_agents.zoo.judge.probes import probe as probes
+from wpt_agents.zoo.plan.presets import keywords
+from wpt_agents.zoo.plan.shared import key
 
 FOLDER = Path("runs") / "bench" / "prediction"
 DMC = ("walker-run", "cheetah-run", "cartpole-swingup", "quadruped-run")
@@ -73,22 +75,25 @@ QUICK = Plan(
 
 
 def rows(
-    quick: bool = False, updates: int | None = None, probe: bool = False
+    quick: bool = False,
+    updates: int | None = None,
+    probe: bool = False,
+    settings: Sequence[str] = (),
 ) -> Iterator[dict[str, Any]]:
     """Yield a row for each robot and way of predicting; draw `prediction.png` and `strips.png`.
 
     :param updates: of each world model, instead of the plan's; existing models are trained further
     :param probe: yield instead how well linear probes read the true state from the latents of the
         generalist and of each robot's specialist
+    :param settings: keywords of WPT for the world models, as "key=value"
     """
     plan = QUICK if quick else FULL
     if updates is not None:
         plan = plan._replace(updates=updates, further=min(plan.further, updates))
     torch.set_num_threads(1)
-    data = collect(
-        plan.folder / "data", plan.tasks, plan.episodes, workers=1, behaviour=plan.behaviour,
-        env=LOOK,
-    )  # fmt: skip
+    stored = plan.folder / "data"  # of all settings
+    plan = changed(plan, settings)
+    data = collect(stored, plan.tasks, plan.episodes, workers=1, behaviour=plan.behaviour, env=LOOK)
     dataset, held_out = split(data, plan)
     if probe:
         yield from probes_of(plan, dataset)
@@ -103,6 +108,15 @@ def rows(
     at = list(ways).index(LEFT_OUT) + 1
     shown.insert(at, (f"{LEFT_OUT}, left out", LEFT_OUT, unseen))
     yield from compare(ways, tests, plan.folder, shown, LEFT_OUT)
+
+
+def changed(plan: Plan, settings: Sequence[str]) -> Plan:
+    """Return the plan with other keywords of WPT, whose models have a folder of their own."""
+    if not settings:
+        return plan
+    changes = keywords(settings)
+    folder = plan.folder / f"set-{key(changes)}"
+    return plan._replace(folder=folder, model={**plan.model, **changes})
 
 
 def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]]:

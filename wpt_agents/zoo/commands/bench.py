@@ -70,6 +70,15 @@ Steps = Annotated[
     int | None,
     typer.Option(min=1, help="For exploration: the number of training steps of explore-state."),
 ]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="For prediction: a keyword of WPT for the world models, such as `size=mid`; can be "
+        "repeated.",
+    ),
+]
 Probe = Annotated[
     bool,
     typer.Option(
@@ -93,6 +102,7 @@ def bench(
     behaviour: Behaviour = None,
     steps: Steps = None,
     probe: Probe = False,
+    settings: Settings = None,
 ) -> None:
     """Measure speed, data formats, retrieval, prediction or exploration on this machine.
 
@@ -120,6 +130,7 @@ def bench(
         "updates": updates,
         "behaviours": behaviour,
         "steps": steps,
+        "settings": settings,
     }
     everywhere = [c for c in Case if c not in (Case.all, Case.gpu)]  # the case gpu needs one
     for name in everywhere if case == Case.all else [case]:
@@ -147,6 +158,7 @@ PARTIAL = {
     "updates": ("--updates", None),
     "behaviours": ("--behaviour", None),
     "steps": ("--steps", None),
+    "settings": ("--set", None),
 }
 
 

@@ -42,6 +42,7 @@ def budgets(model):
 def test_table_2_is_the_default_of_paper_medium_and_of_new_widths(size):
     settings = Hyperparameters(size=size)
     assert {name: settings.value(name) for name in TABLE_2} == TABLE_2
+    assert settings.value("imagine_starts") == 0  # dreams start from all states, as in Algorithm 1
     assert {name: getattr(Size(64, 32, 8, 8, 4, 32), name) for name in TABLE_2} == TABLE_2
 
 

@@ -54,6 +54,12 @@ def test_the_paper_preset_is_table_2():
     assert preset.wpt["warmup_steps"] * preset.env.action_repeat == 15_000
 
 
+@pytest.mark.parametrize("name", ["mid", "paper"])
+def test_guidance_of_meta_world_falls_over_twice_the_run_as_in_the_paper(name):
+    preset = load_preset("metaworld", name)
+    assert preset.wpt["guidance"] == f"linear(1,0.1,{2 * preset.steps})"
+
+
 def test_frames_become_calls_of_step_by_the_action_repeat():
     assert load_preset("dmc", "debug", ["learn.frames=150_000"]).steps == 75_000
     settings = ["learn.frames=150_000", "env.action_repeat=4"]

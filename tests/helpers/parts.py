@@ -2,6 +2,7 @@
 
     python tests/helpers/parts.py --seeds 3             # all parts, a minute of CPU for each run
     python tests/helpers/parts.py --seeds 3 --only repval_scale=0.3 bin_range=7
+    python tests/helpers/parts.py --seeds 3 --steps 825 --only imagine_starts=None  # equal CPU time
 
 Every variant changes one keyword (or two that belong together) of the settings of `make learn`, and
 learns for 1,000 steps, half of what `make learn` takes, so that faster and slower learning differ.
@@ -45,7 +46,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "ent_coef=linear(1e-2,1e-3,1000)": {"ent_coef": "linear(1e-2,1e-3,1000)"},
     "actor_grad=reinforce": {"actor_grad": "reinforce"},
     "actor_critic_decay=True": {"actor_critic_decay": True},
-    "actor_average=0.99": {"actor_average": 0.99},
+    "actor_average=0.02": {"actor_average": 0.02},
+    "actor_average=0.99": {"actor_average": 0.99},  # nearly the actor itself: shows chance
     "recent_share=0.25": {"recent_share": 0.25},
     "repval_scale=0.3": {"repval_scale": 0.3},
     "slow_critic_scale=1": {"slow_critic_scale": 1.0},
@@ -58,11 +60,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def measured(seed: int, changes: Mapping[str, Any]) -> dict[str, float]:
+def measured(seed: int, steps: int, changes: Mapping[str, Any]) -> dict[str, float]:
     """Learn with one seed, and measure the policy and its networks on new episodes."""
     model = WPT("WPTPolicy", DotEnv(), seed=seed, device="cpu", **SETTINGS | changes)
     start = time.process_time()
-    model.learn(STEPS)
+    model.learn(steps)
     seconds = time.process_time() - start
     mean, _ = evaluate_policy(model, DotEnv(), n_eval_episodes=EPISODES, warn=False)
     value_errors = []
@@ -82,10 +84,10 @@ def measured(seed: int, changes: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def main(seeds: int, only: list[str]) -> None:
+def main(seeds: int, steps: int, only: list[str]) -> None:
     """Print a row as soon as a variant is measured."""
     for name in only or VARIANTS:
-        runs = [measured(seed, VARIANTS[name]) for seed in range(seeds)]
+        runs = [measured(seed, steps, VARIANTS[name]) for seed in range(seeds)]
         shares = " ".join(f"{run['share of the optimum']:.2f}" for run in runs)
         means = {column: np.mean([run[column] for run in runs]) for column in runs[0]}
         cells = [f"{means[column]:.3f}" for column in ("value error", "reward error", "entropy")]
@@ -96,8 +98,9 @@ def main(seeds: int, only: list[str]) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3, help="the number of seeds")
+    parser.add_argument("--steps", type=int, default=STEPS, help="calls of env.step")
     parser.add_argument("--only", nargs="*", default=[], choices=VARIANTS, help="variants")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
-    main(arguments.seeds, arguments.only)
+    main(arguments.seeds, arguments.steps, arguments.only)

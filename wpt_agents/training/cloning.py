@@ -50,8 +50,8 @@ def clone(
     device = action_mask.device
     # The authors' Adam: without decay AdamW is the same.
     optimizer = AdamW(actor.parameters(), settings.learning_rate, weight_decay=0)
-    # At a constant rate the last noisy step is kept. The fall to 0 raised the success of 8 clones
-    # of Meta-World tasks from 51 to 86 %.
+    # A constant rate keeps the noise of the last steps; a fall to 0 averages it out. A deviation
+    # from the paper, which prints one rate (docs/paper.md).
     falling = LinearLR(optimizer, 1.0, 0.0, settings.steps)
     for step in shown(range(settings.steps), settings.steps, "clone", progress_bar):
         rng = streams.numpy(Purpose.CLONE, step)

@@ -6,6 +6,7 @@ from pathlib import Path
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.zoo.plan.methods import AGENTS, METHODS, find_method, sections
 from wpt_agents.zoo.plan.presets import Preset, wpt_keywords
+from wpt_agents.zoo.plan.shared import shipped_for
 from wpt_agents.zoo.result import Change
 
 
@@ -70,12 +71,9 @@ def why_useless(
 
 
 def only_shipped(preset: Preset, methods: Collection[str]) -> bool:
-    """Return whether no pre-training is done, because a shipped model takes its place.
-
-    These models are WPT's; other agents that need one are pre-trained.
-    """
+    """Return whether no pre-training is done, because a shipped model takes its place."""
     pretrained = [METHODS[name] for name in methods if METHODS[name].pretrained]
-    return bool(preset.pretrain.model) and all(one.agent is WPT for one in pretrained)
+    return bool(preset.pretrain.model) and all(shipped_for(preset, one.agent) for one in pretrained)
 
 
 def from_shipped(preset: Preset) -> str:
@@ -91,8 +89,9 @@ def check_shape(preset: Preset, unchanged: Preset, methods: Collection[str]) -> 
 
     :param unchanged: the preset without the user's changes
     """
-    starts = any(METHODS[name].pretrained and METHODS[name].agent is WPT for name in methods)
-    for name in WPT.shape_keywords if starts and preset.pretrain.model else ():
+    chosen = [METHODS[name] for name in methods]
+    starts = any(one.pretrained and shipped_for(preset, one.agent) for one in chosen)
+    for name in WPT.shape_keywords if starts else ():
         value = preset.wpt.get(name)
         if value != unchanged.wpt.get(name):
             raise ValueError(f"--set {name}={value} is not possible: {from_shipped(preset)}")

@@ -29,6 +29,14 @@ def key(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
+def shipped_for(preset: Preset, agent: type[BaseAlgorithm]) -> str:
+    """Return the model of the library that replaces an agent's pre-training, or "".
+
+    These models are WPT's; other agents that need one are pre-trained.
+    """
+    return preset.pretrain.model if agent is WPT else ""
+
+
 @dataclass(frozen=True)
 class Shared:
     """The shared stages of a preset.
@@ -87,8 +95,8 @@ class Shared:
 
     @property
     def shipped(self) -> str:
-        """The model of the library that replaces pre-training, or "": they are all WPT's."""
-        return self.preset.pretrain.model if self.agent is WPT else ""
+        """The model of the library that replaces pre-training, or ""."""
+        return shipped_for(self.preset, self.agent)
 
     @property
     def model_path(self) -> Path:

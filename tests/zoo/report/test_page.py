@@ -319,3 +319,15 @@ def test_figure_2_shows_its_six_tasks_and_names_what_is_missing(page, tmp_path):
     make_run(tmp_path / "other", "metaworld-reach", 0, "wpt", (9.0, 1.0))
     write_page(tmp_path / "other", tmp_path / "other.html")
     assert "Figure 2" not in text((tmp_path / "other.html").read_text())
+
+
+def test_figure_2_names_runs_that_have_no_curve(tmp_path):
+    for method in ("wpt", "scratch"):
+        folder = make_run(tmp_path, "dmc-walker-run", 0, method)
+        (folder / "evaluations.npz").unlink()
+        write_page(tmp_path, tmp_path / "page.html")
+        page = (tmp_path / "page.html").read_text()
+        assert f"no evaluations of {method}" in text(page) and '<a href="#figure-2">' in page
+        make_run(tmp_path, "dmc-walker-run", 1, method)  # one seed with a curve is enough
+    write_page(tmp_path, tmp_path / "page.html")
+    assert "no evaluations of" not in text((tmp_path / "page.html").read_text())

@@ -26,7 +26,7 @@ class Figure2:
     :param curves: SVG, one for each task
     :param names: of the curves' experiments
     :param all_names: of all experiments of the page, for the colours
-    :param missing: a line for each task that lacks methods
+    :param missing: lines about tasks that lack methods, or evaluations of them
     """
 
     curves: Sequence[str]
@@ -37,19 +37,30 @@ class Figure2:
 
 def figure_2(runs: Sequence[Finished], names: Names) -> Figure2 | None:
     """Return Fig. 2 from the existing runs; None if there is no run of its tasks."""
-    drawn = [task_curves(task, runs, names) for task in FIGURE_2]
-    curves = [figure for figure in drawn if figure is not None]
-    if not curves:
+    of_figure = [run for run in runs if run.result.task in FIGURE_2]
+    if not of_figure:
         return None
-    missing = []
-    for task in FIGURE_2:
-        methods = {run.result.method for run in runs if run.result.task == task}
-        lacking = [method for method in COMPARED if method not in methods]
-        if len(lacking) == len(COMPARED):
-            missing.append(f"{task}: no run")
-        elif lacking:
-            missing.append(
-                f"{task}: no run of {counted(len(lacking), 'method')}, {', '.join(lacking)}"
-            )
-    drawn_names = {names(run.experiment) for run in runs if run.result.task in FIGURE_2}
-    return Figure2(curves, [n for n in names.all if n in drawn_names], names.all, missing)
+    drawn = [task_curves(task, of_figure, names) for task in FIGURE_2]
+    drawn_names = {names(run.experiment) for run in of_figure if run.evaluations()}
+    return Figure2(
+        curves=[figure for figure in drawn if figure is not None],
+        names=[name for name in names.all if name in drawn_names],
+        all_names=names.all,
+        missing=[line for task in FIGURE_2 for line in _missing(task, of_figure)],
+    )
+
+
+def _missing(task: str, runs: Sequence[Finished]) -> list[str]:
+    """Return lines about methods without a run of a task, and about runs without a curve."""
+    of_task = [run for run in runs if run.result.task == task]
+    methods = dict.fromkeys(run.result.method for run in of_task)
+    drawn = {run.result.method for run in of_task if run.evaluations()}
+    lacking = [method for method in COMPARED if method not in methods]
+    lines = []
+    if len(lacking) == len(COMPARED):
+        lines.append(f"{task}: no run")
+    elif lacking:
+        lines.append(f"{task}: no run of {counted(len(lacking), 'method')}, {', '.join(lacking)}")
+    if undrawn := [method for method in methods if method not in drawn]:
+        lines.append(f"{task}: no evaluations of {', '.join(undrawn)}")
+    return lines

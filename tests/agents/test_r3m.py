@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from debug_agent import ClockEnv, recorded, same, weights
 from plain import Adam, parameters
 
+from wpt_agents.agents import r3m
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.model.time_contrastive import aligned, draw_clips
@@ -51,8 +52,8 @@ def test_pre_training_aligns_held_out_clips(tmp_path):
     with TrajectoryDataset.create(tmp_path / "drift") as data:
         for seed in range(8):
             data.append(drift(16, seed))
-    rng = np.random.default_rng(1)
-    clips = draw_clips([drift(16, seed) for seed in range(100, 110)], 300, rng)
+    rng, unseen = np.random.default_rng(1), [drift(16, seed).image for seed in range(100, 110)]
+    clips = draw_clips(np.full(10, 16), lambda i, times: unseen[i][times], 300, rng)
     order = (clips[:, 1] != clips[:, 2]).flatten(1).any(1)
 
     def share(model):
@@ -112,6 +113,20 @@ def test_pre_training_continues_exactly_from_its_model_file(dataset, tmp_path):
     R3M.pretrain(dataset, steps=2, run_dir=tmp_path, **SETTINGS)
     resumed = R3M.pretrain(dataset, steps=4, run_dir=tmp_path, **SETTINGS)
     assert resumed.progress.pretrain_steps == 4 and same(weights(whole), weights(resumed))
+
+
+def test_data_that_do_not_fit_into_memory_are_read_in_every_update_with_the_same_result(
+    dataset, monkeypatch
+):
+    whole = R3M.pretrain(dataset, steps=2, **SETTINGS)
+    size = int((dataset.lengths + 1).sum()) * 64 * 64 * 3
+    monkeypatch.setattr(r3m, "IN_MEMORY", size - 1)
+    monkeypatch.setattr(TrajectoryDataset, "__getitem__", lambda *_: pytest.fail("reads them all"))
+    part = R3M.pretrain(dataset, steps=2, **SETTINGS)
+    assert same(weights(whole), weights(part))
+    monkeypatch.setattr(r3m, "IN_MEMORY", size)
+    with pytest.raises(pytest.fail.Exception):
+        R3M.pretrain(dataset, steps=1, **SETTINGS)
 
 
 def test_the_encoder_is_frozen_downstream_and_kept_by_new_tasks(dataset):

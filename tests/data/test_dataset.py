@@ -56,6 +56,13 @@ def test_a_trajectory_comes_back_as_it_was(tmp_path, codec, length):
         np.testing.assert_array_equal(getattr(new, name), value)
 
 
+def test_single_images_are_those_of_the_trajectory(tmp_path):
+    dataset = made(tmp_path, chain(3), chain(40))
+    times = [40, 0, 17, 16, 15, 31]
+    np.testing.assert_array_equal(dataset.images(1, times), dataset[1].image[times])
+    np.testing.assert_array_equal(dataset.subset([1]).images(0, [7]), dataset[1].image[[7]])
+
+
 def test_missing_rewards_and_labels_stay_missing(tmp_path):
     new = made(tmp_path, chain(20, reward=None))[0]
     assert (new.reward, new.embodiment, new.task, new.source) == (None, None, None, None)

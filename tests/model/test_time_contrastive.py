@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from debug_agent import recorded
 
-from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.time_contrastive import (
     aligned,
     derangements,
@@ -55,7 +54,8 @@ def test_identical_features_have_a_finite_gradient():
 
 def test_clips_are_in_order_and_reach_all_images():
     image = np.repeat(np.arange(6, dtype=np.uint8), 64 * 64 * 3).reshape(6, 64, 64, 3)
-    clips = draw_clips([Trajectory(image, np.zeros((5, 1)))], 2000, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    clips = draw_clips(np.array([5]), lambda i, times: image[times], 2000, rng)
     s0, s1, s2 = clips[:, :, 0, 0, 0].int().T
     assert (s0 < s1).all() and (s1 <= s2).all() and (s1 == s2).any()
     assert set(s0.tolist()) == set(range(5)) and set(s2.tolist()) == set(range(1, 6))

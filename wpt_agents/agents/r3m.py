@@ -6,6 +6,7 @@ https://arxiv.org/abs/2212.05749.
 """
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -21,6 +22,7 @@ from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords, DrQv2Learner, DrQv2Pol
 from wpt_agents.agents.frame_agent import FrameProgress
 from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.behavior_cloning import FRAMES
@@ -40,6 +42,20 @@ from wpt_agents.training.randomness import Purpose
 
 BACKBONES = ("conv", "resnet18", "resnet34", "resnet50")
 NEGATIVES = 3  # other clips that each clip is contrasted with
+IN_MEMORY = 4e9  # bytes of images; larger datasets are read from the disk in every update
+
+
+def images_of(dataset: TrajectoryDataset) -> Callable[[int, list[int]], np.ndarray]:
+    """Return a function of a trajectory's number and some times that returns the images there."""
+    if (dataset.lengths + 1).sum() * 3 * dataset.image_size**2 > IN_MEMORY:
+        return dataset.images
+    loaded = [trajectory.image for trajectory in dataset]
+
+    def images(i: int, times: list[int]) -> np.ndarray:
+        chosen: np.ndarray = loaded[i][times]
+        return chosen
+
+    return images
 
 
 class FrameFeatures(nn.Module):
@@ -269,11 +285,11 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
 
     def _pretrain(self, steps: int, run: Pretraining, progress_bar: bool) -> None:
         assert self.dataset is not None
-        trajectories = list(self.dataset)
+        lengths, images = self.dataset.lengths, images_of(self.dataset)
         done = self.progress.pretrain_steps
         for step in shown(range(done, steps), steps, "pre-train", progress_bar, done):
             rng = self.streams.numpy(Purpose.PRETRAIN, step)
-            clips = draw_clips(trajectories, self.hyperparameters.clips, rng)
+            clips = draw_clips(lengths, images, self.hyperparameters.clips, rng)
             others = derangements(len(clips), NEGATIVES, rng).to(self.device)
             clips = random_crop(clips, rng).to(self.device)
             run.finish_update(self.learner.pretrain(clips, others))

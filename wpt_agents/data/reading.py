@@ -153,6 +153,14 @@ class StoredTrajectories:
             chunk = range(at, min(at + batch, len(self)))
             yield np.stack(list(self._threads.map(self._first_image, chunk)))
 
+    def images(self, i: int, times: Sequence[int]) -> np.ndarray:
+        """Return images of trajectory `i`, (len(times), S, S, 3) uint8; only their blocks are read.
+
+        :raises ValueError: the trajectory is damaged
+        """
+        parts = [self._read((i, time, time + 1)) for time in times]
+        return np.stack([part.image[start] for part, start, _ in parts])
+
     def _first_image(self, i: int) -> np.ndarray:
         image: np.ndarray = self._read((i, 0, 1))[0].image[0]
         return image.copy()  # a view would keep its whole block in memory

@@ -5,14 +5,12 @@ published code draws permutations in which a clip can meet itself.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-from wpt_agents.data.trajectory import Trajectory
 
 
 def similarity(x: Tensor, y: Tensor) -> Tensor:
@@ -55,14 +53,23 @@ def aligned(z: Tensor) -> Tensor:
     return (similarity(z1, z2) > similarity(z0, z2)).float().mean()
 
 
-def draw_clips(trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator) -> Tensor:
-    """Draw images s0 < s1 <= s2 of random trajectories: (size, 3, 64, 64, 3) uint8."""
+def draw_clips(
+    lengths: np.ndarray,
+    images: Callable[[int, list[int]], np.ndarray],
+    size: int,
+    rng: np.random.Generator,
+) -> Tensor:
+    """Draw images s0 < s1 <= s2 of random trajectories: (size, 3, 64, 64, 3) uint8.
+
+    :param lengths: (N,), the number of actions of each trajectory, one less than its images
+    :param images: returns the images of a trajectory, by its number, at some times
+    """
     clips = []
-    for i in rng.integers(len(trajectories), size=size):
-        image = trajectories[i].image
-        first = rng.integers(len(image) - 1)
-        second = rng.integers(first + 1, len(image))
-        clips.append(image[[first, second, rng.integers(second, len(image))]])
+    for i in rng.integers(len(lengths), size=size):
+        end = int(lengths[i]) + 1
+        first = int(rng.integers(end - 1))
+        second = int(rng.integers(first + 1, end))
+        clips.append(images(int(i), [first, second, int(rng.integers(second, end))]))
     return torch.from_numpy(np.stack(clips))
 
 

@@ -237,6 +237,17 @@ def test_every_method_can_be_planned_from_every_preset(method, tmp_path):
         assert run.config() and run.folder and run.shared.model_path
 
 
+@pytest.mark.parametrize(("suite", "preset"), ALL)
+def test_all_methods_have_the_same_frames_evaluations_and_choice_of_the_best_policy(
+    suite, preset, tmp_path
+):
+    where = suite, [TASK_OF[suite]], preset, "7-7", list(METHODS), []
+    runs = make_plan(*where, tmp_path, 1, "cpu")
+    assert [run.method for run in runs] == list(METHODS)
+    budgets = {(run.preset.learn, run.preset.evaluate, run.evaluation_seed) for run in runs}
+    assert len(budgets) == 1
+
+
 @pytest.mark.parametrize("preset", ["demo", "mid"])
 def test_only_wpt_starts_from_the_world_model_of_the_library(preset, tmp_path):
     [ours] = plan("metaworld", ["reach"], preset, tmp_path, "wpt")

@@ -1,7 +1,9 @@
 """With the preset `paper` the baselines have the settings of their published code."""
 
 import pytest
+from stable_baselines3 import SAC
 
+from wpt_agents.zoo.plan.methods import defaults
 from wpt_agents.zoo.plan.runs import make_plan
 
 COMMON = {"gamma": 0.99, "batch_size": 256, "pad": 4}
@@ -55,6 +57,34 @@ MRQ = COMMON | {
     "learning_starts": 10_000,
     "warmup_steps": 10_000,
 }
+# dmc_vision in configs.yaml of danijar/dreamerv3, as far as WPT has a keyword for it
+DREAMER_V3 = {
+    "batch_size": 16,
+    "batch_length": 64,
+    "train_ratio": 256,
+    "gamma": 0.997,
+    "lam": 0.95,
+    "imagine_horizon": 15,
+    "ent_coef": 3e-4,
+    "free_nats": 1.0,
+    "free_nats_mode": "element",
+    "dyn_scale": 1.0,
+    "rep_scale": 0.1,
+    "return_norm": True,
+    "zero_init_heads": True,
+    "actor_outscale": 0.01,
+    "actor_grad": "reinforce",
+    "continue_head": True,
+    "repval_scale": 0.3,
+    "slow_critic_scale": 1.0,
+    "target_fraction": 0.02,
+    # It learns from its own episodes alone.
+    "offline_ratio": 0.0,
+    "guidance": 0.0,
+    "kickstart": 0.0,
+}
+# Stable-Baselines3's own algorithm as it ships; a buffer of its default size has 74 GB.
+AS_IT_SHIPS = {name: value for name, value in defaults(SAC).items() if name != "buffer_size"}
 PUBLISHED = {
     "drq-v2": DRQV2,
     "r3m": DRQV2 | {"clips": 16},
@@ -67,6 +97,8 @@ PUBLISHED = {
     # Five heads and β = 1 are our choice; the paper states neither.
     "explore": RLPD | {"label": "optimistic", "reward_members": 5, "beta": 1.0},
     "mrq": MRQ,
+    "dreamer-v3": DREAMER_V3,
+    "sac": AS_IT_SHIPS,
 }
 
 

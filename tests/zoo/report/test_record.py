@@ -215,6 +215,26 @@ def test_the_pages_rows_are_those_of_the_records_tables():
             assert not cell or matching[0].endswith(f"| {cell} |")
 
 
+def test_the_baselines_on_the_page_of_results_are_those_of_their_record():
+    root = Path(__file__).parents[3]
+    page = (root / "docs" / "results.md").read_text()
+    rows = re.findall(r"^\| .*\|$", page.split("\n## Baselines\n")[1].split("\n## ")[0], re.M)
+    recorded = {
+        (one.method, f"{one.success:.2f} ({one.return_:.0f})")
+        for one in record.read(root / "zoo" / "results" / "baselines.csv")
+        if one.success is not None
+    }
+    shown = set()
+    for row in rows:
+        first, *cells = row.replace("*", "").strip("|").split("|")
+        names = re.findall(r"`([^`]+)`", first) or [""]
+        method = names[0]
+        if first.strip().startswith("prior actor"):
+            method = "prior actor" if method == "wpt+" else f"prior actor, {method}"
+        shown |= {(method, score) for score in re.findall(r"\d\.\d\d \(\d+\)", " ".join(cells))}
+    assert len(shown) >= 18 and shown <= recorded
+
+
 def test_methods_are_told_from_doing_nothing_to_ours():
     assert set(METHODS) < set(record.ORDER)
     order = ["nothing", "scratch", "wpt", "wpt, last", "kickstart", "another's"]

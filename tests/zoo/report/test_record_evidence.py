@@ -14,6 +14,7 @@ from wpt_agents.zoo.report.record_tables import usual_budgets
 from wpt_agents.zoo.result import Variant
 
 ROOT = Path(__file__).parents[3]
+RECORDS = sorted(path.stem for path in (ROOT / "zoo" / "results").glob("*.csv"))
 
 
 def line(method, task, score, seed=0, preset="mid", frames=12_000, suite="metaworld"):
@@ -199,7 +200,8 @@ def test_a_record_that_does_not_exist_or_is_empty_needs_runs(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("name", ["mid", "small-benchmark", "tried"])
+@pytest.mark.parametrize("name", RECORDS)
 def test_the_tables_in_the_repository_are_those_of_its_records(name):
+    assert {"baselines", "mid", "small-benchmark", "tried"} <= set(RECORDS)
     path = ROOT / "zoo" / "results" / f"{name}.csv"
     assert record_page.markdown(record.read(path)) == path.with_suffix(".md").read_text()

@@ -1,10 +1,12 @@
 """What all model-free agents must do: files of SB3, several environments, several images."""
 
 import warnings
+import zipfile
 
 import numpy as np
 import pytest
-from debug_agent import ClockEnv, noise, on_time, recorded
+from debug_agent import ClockEnv, noise, on_time, recorded, same, weights
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import DotEnv
 
@@ -68,3 +70,25 @@ def test_a_dataset_that_an_agent_has_no_use_for_is_reported(agent, uses):
         agent("CnnPolicy", DotEnv(), dataset=[recorded()], **NARROW)
     said = [w.filename for w in caught if "dataset= has no effect" in str(w.message)]
     assert said == ([] if uses else [__file__])
+
+
+@pytest.mark.filterwarnings("ignore:.*without offline data")
+@pytest.mark.parametrize(
+    ("agent", "widths"), AGENTS, ids=lambda value: getattr(value, "__name__", "")
+)
+def test_a_callback_stops_it_and_its_files_hold_json_and_tensors_alone(agent, widths, tmp_path):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 16
+
+    model = agent("CnnPolicy", ClockEnv(), seed=0, **NARROW, **widths)
+    model.learn(1000, callback=Stop())
+    assert model.num_timesteps == 16
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.zip")
+    for file in ("model.zip", "replay.zip"):
+        names = zipfile.ZipFile(tmp_path / file).namelist()
+        assert {name.rpartition(".")[2] for name in names} <= {"json", "safetensors", "npy"}
+    loaded = agent.load(tmp_path / "model.zip", env=ClockEnv(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "replay.zip")
+    assert same(weights(model), weights(loaded)) and len(loaded.replay_buffer.trajectories) == 2

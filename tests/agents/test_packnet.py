@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 from collections import defaultdict
 
 import numpy as np
@@ -241,3 +242,18 @@ def test_a_sequence_that_is_over_and_another_action_width_are_refused():
     assert np.isfinite(actions(model.policy_of(1))).all()
     with pytest.raises(ValueError, match="no policy of task 2 yet: pass a number from 0 to 1"):
         model.policy_of(2)
+
+
+def test_noise_warm_up_and_the_first_update_begin_again_with_every_task():
+    changes = {"std": "linear(1,0,50)", "learning_starts": 20, "warmup_steps": 10}
+    model = agent(ClockEnv(25), **changes).learn(25)
+    made = model.updates
+    assert model.std_now == 0.5 and made > 0
+    model.next_task(ClockEnv(25))
+    retrained = model.updates
+    assert model.std_now == 1.0 and model.num_timesteps == 0
+    drawn, window = [], model._draw_window
+    model._draw_window = lambda: drawn.append(window()) or drawn[-1]
+    model.learn(25, reset_num_timesteps=False)
+    assert drawn[0] == (0, sys.maxsize)  # the whole first episode is random, as in the first task
+    assert model.updates - retrained == made

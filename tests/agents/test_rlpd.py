@@ -176,15 +176,20 @@ def test_offline_actions_are_brought_into_the_units_of_the_environment(tmp_path)
     np.testing.assert_allclose(read.action, 2 * np.abs(one.action) - 1, atol=1e-6)
 
 
-def test_a_loaded_model_goes_on_exactly(dataset, tmp_path):
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_a_loaded_model_goes_on_exactly(n_envs, dataset, tmp_path):
+    def environments():
+        return DummyVecEnv([ClockEnv] * n_envs)
+
     data, settings = dataset(), {"label": "optimistic"}
-    whole = agent(ClockEnv(), data, **settings).learn(42)
-    half = agent(ClockEnv(), data, **settings).learn(21)
+    whole = agent(environments(), data, **settings).learn(42 * n_envs)
+    half = agent(environments(), data, **settings).learn(21 * n_envs)
     half.save(tmp_path / "model")
     half.save_replay_buffer(tmp_path / "replay.zip")
-    loaded = RLPD.load(tmp_path / "model", env=ClockEnv(), dataset=data, device="cpu")
+    loaded = RLPD.load(tmp_path / "model", env=environments(), dataset=data, device="cpu")
     loaded.load_replay_buffer(tmp_path / "replay.zip")
-    loaded.learn(21, reset_num_timesteps=False)
+    loaded.learn(21 * n_envs, reset_num_timesteps=False)
+    assert whole.updates == loaded.updates > half.updates > 0
     assert same(weights(whole), weights(loaded))
 
 

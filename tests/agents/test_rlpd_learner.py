@@ -8,7 +8,9 @@ import torch
 from gymnasium import spaces
 from plain import Adam, assert_close, batch_of, encode, parameters, trunk, two_layers
 
+from wpt_agents.agents.optimistic import optimistic_reward
 from wpt_agents.agents.rlpd import RLPDKeywords, RLPDLearner, RLPDPolicy
+from wpt_agents.data.transitions import Transitions
 from wpt_agents.training.model_files import optimizers
 
 IMAGES = spaces.Box(0, 255, (64, 64, 3), np.uint8)
@@ -172,3 +174,34 @@ def test_the_reward_ensemble_never_reads_the_offline_rows_rewards():
         learner_of(policy).update(batch, ONLINE, torch.Generator().manual_seed(0))
         results.append(copies(policy))
     assert all(torch.equal(results[0][k], results[1][k]) for k in results[0])
+
+
+def squares(columns):
+    """Stacks of frames (n, 3, 64, 64, 3) with a bright square at each of the columns."""
+    image = np.zeros((len(columns), 3, 64, 64, 3), np.uint8)
+    for row, column in enumerate(columns):
+        image[row, :, 24:40, column : column + 16] = 250
+    return torch.from_numpy(image)
+
+
+def test_the_bonus_falls_on_repeated_images_and_is_larger_on_unseen_ones():
+    torch.manual_seed(0)
+    box = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    widths = {"channels": 4, "feature_dim": 16, "hidden_dim": 32, "critics": 2}
+    policy = RLPDPolicy(IMAGES, box, reward_members=5, **widths)
+    learner = RLPDLearner(policy, RLPDKeywords(learning_rate=RATE, beta=1.0))
+    seen, unseen = squares(range(0, 16, 2)), squares(range(32, 48, 2))
+    n, reward = len(seen), torch.linspace(0, 1, len(seen))
+    image = torch.cat([seen, seen])  # the second half stands for offline data, of the same images
+    poison = torch.full((n,), 1e6)
+    batch = Transitions(
+        image, torch.zeros(2 * n, 2), torch.cat([reward, poison]), torch.full((2 * n,), 0.9), image
+    )
+    metrics = [learner.update(batch, n) for _ in range(150)]
+    first, last = metrics[0], metrics[-1]
+    assert last["explore/bonus"] < 0.5 * first["explore/bonus"]
+    assert last["explore/bonus_share"] < first["explore/bonus_share"]
+    with torch.no_grad():
+        latent = policy.critic.trunk(policy.encoder(unseen))
+        _, surprise = optimistic_reward(policy.reward_ensemble(latent), 1.0)
+    assert surprise.mean() > 2 * last["explore/bonus"]

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import count
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +13,7 @@ from test_resume import KillAt, Killed
 from wpt_envs.tasks import TASKS
 from zoo_command import call
 
+from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
 from wpt_agents.zoo.plan.presets import load_preset, preset_names
@@ -90,9 +92,50 @@ def test_a_killed_sequence_ends_as_one_that_was_not(method, tmp_path, monkeypatc
     assert read_row(killed.runs[0].folder) and not read_row(killed.runs[1].folder)
     assert list(killed.runs[1].folder.glob("checkpoints/step-*"))
     assert len(read_sequence(killed.folder).rows) == 1
+    assert_ends_alike(killed, whole, expected)
+
+
+def assert_ends_alike(killed, whole, expected):
+    """That a killed sequence, run again, has the scores and the model of an undisturbed one."""
     assert returns(run_sequence(killed)) == returns(expected)
     one, other = tensors(whole.runs[1].folder), tensors(killed.runs[1].folder)
     assert one.keys() == other.keys() and all((one[k] == other[k]).all() for k in one)
+
+
+def killing(function, at):
+    """The function, but the call of this number, from 0 on, ends in a kill."""
+    numbers = count()
+
+    def killed(*args, **kwargs):
+        if next(numbers) == at:
+            raise Killed
+        return function(*args, **kwargs)
+
+    return killed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "owner", "name", "at"),
+    [
+        ("packnet", PackNet, "_retrain", 0),  # the second task begins by pruning the first
+        ("packnet", sequences, "_play", 1),  # the second task is learned, but has no scores yet
+        ("wpt", sequences, "_play", 1),
+        ("wpt", sequences, "learn", 1),  # before the second task's first step
+        ("wpt", sequences, "write_sequence", 0),  # the first task's scores are written alone
+    ],
+)
+def test_a_sequence_that_is_killed_between_two_tasks_ends_as_one_that_was_not(
+    method, owner, name, at, tmp_path, monkeypatch
+):
+    whole, killed = (sequence(tmp_path / folder, method, tasks=2) for folder in ("one", "other"))
+    expected = run_sequence(whole)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, killing(getattr(owner, name), at))
+        with pytest.raises(Killed):
+            run_sequence(killed)
+    assert read_row(killed.runs[0].folder) and not read_row(killed.runs[1].folder)
+    assert_ends_alike(killed, whole, expected)
 
 
 def test_a_sequence_that_fails_is_reported_and_stops_no_other(tmp_path, monkeypatch):

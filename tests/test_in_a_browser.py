@@ -19,7 +19,10 @@ from wpt_agents.zoo.report.page import write_page
 ROOT = Path(__file__).parents[1]
 WIDTHS = (390, 820, 1440)
 SCHEMES = ("light", "dark")
-PAGES = ("index", "quickstart", "data", "when-it-does-not-learn", "api/model", "search")
+PAGES = (
+    *("index", "quickstart", "data", "results", "when-it-does-not-learn", "api/model", "search"),
+    *("algorithms/drqv2", "tutorials/4-a-row-of-the-paper"),
+)
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
@@ -90,6 +93,9 @@ def report(tmp_path_factory):
     failed.mkdir()
     (failed / "config.yaml").write_text("task: x")
     (failed / "error.txt").write_text("Traceback\nRuntimeError: out of luck\n")
+    words = "run --tasks walker-stand --preset debug --workers 1 --device cpu --out"
+    command = [sys.executable, "-m", "wpt_agents.zoo", *words.split(), str(runs)]
+    subprocess.run(command, check=True)  # a whole run, with its video and pictures
     page = runs / "report" / "index.html"
     write_page(runs, page)
     return page

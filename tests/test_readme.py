@@ -3,7 +3,6 @@
 import ast
 import inspect
 import re
-import shlex
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
@@ -12,20 +11,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env
-import typer
 from debug_agent import SETTINGS, agent
 from stable_baselines3.common.logger import Logger
-from typer.core import TyperGroup
-from typer.main import get_command
 from wpt_envs import dmc
 from wpt_envs.tasks import TASKS
 
 import wpt_agents
-from wpt_agents.zoo.collect.collection import BEHAVIOURS
-from wpt_agents.zoo.commands import app as command_line
-from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.plan.presets import load_preset, suite_names
-from wpt_agents.zoo.tasks import find_tasks
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -55,12 +46,6 @@ def section(title, page=README):
 
 
 EXAMPLE = blocks(section("Example"))[0]
-COMMANDS = {
-    command.replace("\\\n", " ")
-    for text in [README, *PAGES.values()]
-    for block in blocks(text, "bash")
-    for command in re.findall(r"^python -m wpt_agents\.zoo ((?:.*\\\n)*[^#\n]*)", block, re.M)
-}
 NAMES = re.findall(r"`((?:\w+\.)+\w+)`", section("The paper, by name", PAGES["paper.md"]))
 
 
@@ -123,20 +108,6 @@ def test_the_table_of_the_paper_names_what_exists():
         assert callable(resolve_name(f"wpt_agents.{name}")), name
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_of_readme_and_docs_is_understood(command):
-    words = shlex.split(re.sub(r"\$\([^)]*\)", "FILE", command))
-    parser = get_command(command_line.app)
-    while isinstance(parser, TyperGroup):
-        _, parser, words = parser.resolve_command(typer.Context(parser), words)
-    options = parser.make_context("zoo", words).params
-    tasks = [task for task in options.get("tasks") or [] if "$" not in task]
-    suite = options.get("suite") or "dmc"
-    find_tasks(suite, tasks)
-    if options.get("preset") and suite in suite_names():
-        load_preset(suite, options["preset"], options.get("settings") or [])
-    assert set(options.get("method") or []) <= set(METHODS)
-    assert (options.get("behaviour") or "noise") in BEHAVIOURS
 
 
 def test_every_task_and_keyword_that_is_named_exists():
@@ -146,13 +117,6 @@ def test_every_task_and_keyword_that_is_named_exists():
     assert f"{len(TASKS)} from pixels" in README
     keywords = set(re.findall(r"^\| `(\w+)` \|", section("Keywords", PAGES["envs.md"]), re.M))
     assert keywords == inspect.signature(dmc.make).parameters.keys() - {"task", "render_mode"}
-
-
-@pytest.mark.parametrize("name", ["../README.md", *PAGES])
-def test_links_lead_somewhere(name):
-    path = ROOT / "docs" / name
-    for target in re.findall(r"\]\((?!http)([^)#]+)(?:#[^)]*)?\)", path.read_text()):
-        assert (path.parent / target).exists(), target
 
 
 @pytest.mark.parametrize("name", ["../README.md", *PAGES])

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from wpt_envs.headless import RenderingError
 from wpt_envs.tasks import TASKS, Task
 
 
@@ -16,14 +17,17 @@ def main() -> None:
         "montage",
         help="Draw every task in the three renderings, exact, near and fast, into one picture.",
     )
-    montage.add_argument("path", type=Path)
-    montage.add_argument("--size", type=int, default=64)
+    montage.add_argument("path", type=Path, help="The picture to write, such as tasks.png.")
+    montage.add_argument("--size", type=int, default=64, help="Side of each image in pixels.")
     likeness = commands.add_parser(
         "likeness", help="Print the PSNR of near and fast against exact, in dB."
     )
-    likeness.add_argument("--states", type=int, default=20)
+    likeness.add_argument(
+        "--states", type=int, default=20, help="Number of states of each task that are drawn."
+    )
     for command in (montage, likeness):
-        command.add_argument("--suite", choices=sorted({task.suite for task in TASKS.values()}))
+        suites = sorted({task.suite for task in TASKS.values()})
+        command.add_argument("--suite", choices=suites, help="Only the tasks of this suite.")
     speed = commands.add_parser(
         "speed",
         help="Print the CPU time of a step for each rendering and the simulator's own renderer.",
@@ -41,7 +45,10 @@ def main() -> None:
         "likeness": _likeness,
         "speed": _speed,
     }
-    run[arguments.pop("command")](**arguments)
+    try:
+        run[arguments.pop("command")](**arguments)
+    except (RenderingError, ImportError, OSError) as error:  # no traceback, as in the zoo
+        parser.exit(2, f"Error: {error}\n")
 
 
 def _list() -> None:

@@ -26,6 +26,10 @@ _PLATFORM_DEVICE = 0x313F  # EGL_PLATFORM_DEVICE_EXT
 _preferred_here = False
 
 
+class RenderingError(RuntimeError):
+    """Nothing can be drawn off screen; the message says what to set or to install."""
+
+
 def prefer_egl() -> None:
     """Set `MUJOCO_GL` if the user did not, and normalise its spelling."""
     global _preferred_here
@@ -49,7 +53,7 @@ def prefer_egl() -> None:
 def choose() -> None:
     """Check that `MUJOCO_GL` works; replace a value set by `prefer_egl` with OSMesa if necessary.
 
-    :raises RuntimeError: if the value does not work here; names one that does
+    :raises RenderingError: if the value does not work here; names one that does
     """
     global _preferred_here
     asked = os.environ.get("MUJOCO_GL", "")
@@ -62,23 +66,23 @@ def choose() -> None:
     if works():
         return
     if asked in _WINDOW:
-        raise RuntimeError(
+        raise RenderingError(
             f"MUJOCO_GL={asked} draws in a window, but there is no display that works: unset "
             "MUJOCO_GL, or set MUJOCO_GL=egl"
         )
     if not _preferred_here:
-        raise RuntimeError(
+        raise RenderingError(
             f"MUJOCO_GL={asked} does not work here; unset it. {_INSTALL}{_suspects()}"
         )
     if not _osmesa_works():
-        raise RuntimeError(_INSTALL + _suspects())
+        raise RenderingError(_INSTALL + _suspects())
     os.environ["MUJOCO_GL"], _preferred_here = "osmesa", False
     _agree_with_pyopengl()
 
 
 def _check_name(asked: str) -> None:
     if asked in _NONE:
-        raise RuntimeError(
+        raise RenderingError(
             f"MUJOCO_GL={asked} forbids to draw, which this package needs: unset MUJOCO_GL, or "
             "set MUJOCO_GL=egl"
         )
@@ -86,7 +90,7 @@ def _check_name(asked: str) -> None:
     if asked not in valid:
         near = difflib.get_close_matches(asked, valid, n=1, cutoff=0.5)
         hint = f" Did you mean {near[0]}?" if near else ""
-        raise RuntimeError(
+        raise RenderingError(
             f"MUJOCO_GL={asked} is not known.{hint} There are: {', '.join(valid)}, or leave it "
             "unset"
         )
@@ -100,7 +104,7 @@ def _check_device() -> None:
     count = len(_egl_devices())
     if not asked.strip().isdecimal() or not int(asked) < count:
         there = f"a number from 0 to {count - 1}" if count else "no device at all"
-        raise RuntimeError(
+        raise RenderingError(
             f"MUJOCO_EGL_DEVICE_ID={asked} is not an EGL device; EGL has {there} here: unset it, "
             "or set a number. EGL numbers the GPUs from 0 and has no names such as cuda:0"
         )

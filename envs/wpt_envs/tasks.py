@@ -86,9 +86,12 @@ def _rows() -> list[Task]:
     return rows
 
 
+#: Every task by its id, such as "wpt/dmc-walker-run-v0".
+#:
+#: :meta hide-value:
 TASKS: dict[str, Task] = {task.id: task for task in _rows()}
 
-# B.1, the order in which one agent learns them
+#: The ids of the tasks of B.1 of the paper, in the order in which one agent learns them.
 ANT_SEQUENCE: tuple[str, ...] = tuple(
     f"wpt/dmc-quadruped-{name}-v0" for name in ("stand", "walk", "run", "jump", "roll", "roll-fast")
 )

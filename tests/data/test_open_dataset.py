@@ -1,11 +1,14 @@
 """`open_dataset` takes whatever can serve as a dataset."""
 
+import inspect
+
 import numpy as np
 import pytest
 from chain import chain
 
 from wpt_agents.data.convert import open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.importers.formats import FORMATS
 from wpt_agents.data.replay import ReplayBuffer
 
 
@@ -46,6 +49,14 @@ def test_trajectories_one_or_many_are_stored_in_a_temporary_folder():
     assert len(view[0]) == 5 and path.exists()  # a view keeps the folder
     del view
     assert not path.exists()
+
+
+def test_the_constructors_are_documented_functions():
+    for form in FORMATS:
+        door = getattr(TrajectoryDataset, f"from_{form}")
+        assert inspect.isfunction(door) and door.__qualname__ == f"TrajectoryDataset.from_{form}"
+        assert FORMATS[form].__name__ in door.__doc__
+        assert list(inspect.signature(door).parameters)[:2] == ["source", "path"]
 
 
 def test_the_doors_of_the_class_lead_here(tmp_path):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from wpt_envs import __main__ as command_line
 from wpt_envs import headless
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the variables are Linux's")
@@ -105,3 +106,14 @@ def test_a_simulator_that_was_imported_first_still_draws_without_a_display(first
     code = [sys.executable, "-c", DRAW.format(first=first, env=env)]
     run = subprocess.run(code, env=variables, capture_output=True, text=True)
     assert "drawn True" in run.stdout, (run.returncode, run.stderr)
+
+
+def test_the_command_line_says_in_one_sentence_what_is_missing(monkeypatch, capsys):
+    def fail(**_):
+        raise headless.RenderingError("Drawing off screen needs EGL")
+
+    monkeypatch.setattr(sys, "argv", ["wpt_envs", "montage", "tasks.png"])
+    monkeypatch.setattr(command_line, "_montage", fail)
+    with pytest.raises(SystemExit, match="2"):
+        command_line.main()
+    assert capsys.readouterr().err == "Error: Drawing off screen needs EGL\n"

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -254,7 +253,13 @@ DOOR = """Convert `{form}` data into a dataset; an interrupted conversion contin
 
 
 def _door(form: str) -> Callable[..., TrajectoryDataset]:
-    door = partial(convert, form=form)
+    def door(
+        source: Source | SB3Buffer, path: Source, progress_bar: bool = False, **options: Any
+    ) -> TrajectoryDataset:
+        return convert(source, path, progress_bar, form, **options)
+
+    door.__name__ = f"from_{form}"
+    door.__qualname__ = f"TrajectoryDataset.{door.__name__}"
     door.__doc__ = DOOR.format(form=form, reader=FORMATS[form].__name__)
     return door
 

@@ -83,10 +83,12 @@ class Size:
                 raise ValueError(f"Size.{name} must be a number above 0, got {value!r}")
 
 
-# `paper`: Table 2 prints 12288 as hidden and 1536 as deterministic. Only the other way round does
-# the world model have the 280 M parameters of the text (tests/model/test_world_model.py counts).
-# The others are ours: small enough for a CPU, with learning rates that grow as widths shrink, and
-# with budgets in proportion. The budgets are those of the presets in zoo/*.yaml, rounded.
+#: The sizes by name. Table 2 prints 12288 as hidden and 1536 as deterministic for `paper`. Only the
+#: other way round does the world model have the 280 M parameters of the text, which
+#: tests/model/test_world_model.py counts. The others are ours: small enough for a CPU, with learning
+#: rates that grow as widths shrink, and with the budgets of the presets in zoo/*.yaml, rounded.
+#:
+#: :meta hide-value:
 SIZES = {
     "debug": Size(
         *(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),

@@ -1,6 +1,7 @@
 """The runner's output: the shared console, one line per stage, and progress bars."""
 
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,7 +36,7 @@ def progress(
 
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
-    """Append everything that is printed to a file, progress bars included."""
+    """Append to a file all that is printed, with progress bars, and the traceback of an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     streams = sys.stdout, sys.stderr
     with open(path, "a", buffering=1, encoding="utf-8") as file:
@@ -43,6 +44,9 @@ def logged(path: Path) -> Iterator[None]:
         console.file = file
         try:
             yield
+        except Exception:
+            traceback.print_exc()
+            raise
         finally:
             sys.stdout, sys.stderr = streams
             console.file = None  # type: ignore[assignment]  # in rich it means sys.stdout

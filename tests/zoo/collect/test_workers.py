@@ -69,3 +69,37 @@ def alive(pid):
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
         return state != "Z"  # one that nobody waits for is not alive
     return False
+
+
+POOL = """
+import sys
+import time
+
+from wpt_agents.zoo.collect.workers import worker_pool
+
+
+def begin(path):
+    open(path, "w").close()
+
+
+if __name__ == "__main__":
+    with worker_pool(1) as pool:
+        pool.submit(begin, sys.argv[1]).result()
+        try:
+            time.sleep(600)
+        except KeyboardInterrupt:
+            print("interrupted")
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_workers_without_a_traceback(tmp_path):
+    script, begun = tmp_path / "pool.py", tmp_path / "begun"
+    script.write_text(POOL)
+    command = [sys.executable, str(script), str(begun)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    parent = subprocess.Popen(command, start_new_session=True, **pipes)
+    until(begun.exists)
+    time.sleep(0.5)  # the worker waits for more work
+    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+    assert parent.communicate(timeout=300) == ("interrupted\n", "")

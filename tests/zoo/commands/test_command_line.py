@@ -1,11 +1,16 @@
 """How the command line starts, helps and fails."""
 
+import os
 import re
 import shlex
+import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import typer
 from typer.main import get_command
+from wpt_envs.headless import RenderingError
 from zoo_command import call
 
 from wpt_agents.zoo.commands import app as command_line
@@ -46,6 +51,14 @@ def test_the_examples_of_the_help_are_understood(name):
         command.make_context(name, words)  # raises on what it does not understand
 
 
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in LEAVES])
+def test_a_group_of_commands_has_an_example_of_one(name):
+    [example] = re.findall(r"Example: `python -m wpt_agents\.zoo (.*)`", COMMANDS[name].help)
+    group, command, *words = shlex.split(example)
+    assert group == name
+    LEAVES[f"{group} {command}"].make_context(command, words)
+
+
 @pytest.mark.parametrize("words", ["--tasks a b --set c=1 d=2", "--tasks=a b --set=c=1 d=2"])
 def test_an_option_takes_several_values_however_the_first_is_written(words):
     context = COMMANDS["run"].make_context("run", shlex.split(words))
@@ -69,6 +82,19 @@ def fail(error):
             ModuleNotFoundError("No module named 'dm_control'", name="dm_control"),
             'Error: dm_control is not installed: pip install "wpt-agents[all]"\n',
             2,
+        ),
+        (
+            ImportError("Reading HDF5 needs h5py: pip install h5py"),
+            "Error: Reading HDF5 needs h5py: pip install h5py\n",
+            2,
+        ),
+        (RenderingError("Drawing needs EGL"), "Error: Drawing needs EGL\n", 2),
+        (FloatingPointError("The loss is nan"), "Error: The loss is nan\n", 2),
+        (
+            ModuleNotFoundError("No module named 'wpt_agents.x'", name="wpt_agents.x"),
+            "Error: ModuleNotFoundError: No module named 'wpt_agents.x' (add --debug to see where, "
+            "and please report it)\n",
+            1,
         ),
         (
             KeyError("x"),
@@ -131,3 +157,24 @@ def test_ctrl_c_of_a_forced_run_says_that_force_would_begin_again(monkeypatch, c
     monkeypatch.setattr("wpt_agents.zoo.plan.runs.make_plan", fail(KeyboardInterrupt()))
     assert call(monkeypatch, "run", "--force") == 130
     assert capsys.readouterr().err == "Interrupted. The same command continues without --force.\n"
+
+
+def test_a_simulator_that_this_python_cannot_have_is_named_with_the_newest_that_can(monkeypatch):
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+    simulators = "\n".join(project["optional-dependencies"]["sims"])
+    ends = re.findall(r"^([a-z-]+)[<>=].*python_version < '3\.(\d+)'", simulators, re.M)
+    expected = {name.replace("-", "_"): (3, int(minor)) for name, minor in ends}
+    assert expected == command_line.UNAVAILABLE_FROM != {}
+    monkeypatch.setattr(command_line.sys, "version_info", (3, 13, 1))
+    sentence = "dm_control cannot be installed on this version of Python: use 3.12 or older"
+    assert command_line.missing("dm_control") == sentence
+    assert command_line.missing("metaworld").endswith('pip install "wpt-agents[all]"')
+
+
+def test_a_reader_that_leaves_early_ends_the_command_without_a_word(monkeypatch, capfd):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w", encoding="utf-8") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        assert call(monkeypatch) == 1
+    assert capfd.readouterr().err == ""

@@ -75,6 +75,27 @@ def test_local_does_not_try_again_what_failed_by_itself(tmp_path):
     assert times_done(one) == 1
 
 
+def test_a_process_ends_without_a_traceback_on_the_terminal(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(engines, "end_with_parent", lambda: None)
+    with pytest.raises(SystemExit, match="1"):
+        engines._in_child(fail, job(tmp_path), 1)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_job_that_fails_before_its_run_begins_says_why_in_its_log(tmp_path, monkeypatch):
+    def refuse(_):
+        raise ValueError("worked on by another process")
+
+    one = job(tmp_path)
+    monkeypatch.setattr(engines.runner, "run", refuse)
+    with pytest.raises(ValueError, match="another process"):
+        engines.do(one)
+    reason = engines.why(engines.trace_of(one.folder), 1)
+    assert reason == "ValueError: worked on by another process"
+    (one.folder / "error.txt").write_text("Traceback\nRuntimeError: out of luck\n")
+    assert engines.why(engines.trace_of(one.folder), 1) == "RuntimeError: out of luck"
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_data_that_cannot_be_made_are_told_with_their_own_reason_and_the_log(tmp_path):
     one = job(tmp_path)  # whose task is unknown to other processes

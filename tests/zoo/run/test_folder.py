@@ -36,3 +36,13 @@ def test_a_run_that_another_process_finishes_meanwhile_is_not_begun_again(tmp_pa
     monkeypatch.setattr(runner, "read_result", lambda folder: next(results))
     monkeypatch.setattr(runner, "do_stages", lambda job: "begun again")
     assert runner.run(job(tmp_path, "scratch")).startswith("finished while")
+
+
+@pytest.mark.parametrize("content", ["", "wpt: [1", "- 1"])
+def test_a_damaged_configuration_is_named(content, tmp_path):
+    one = job(tmp_path, "scratch")
+    one.folder.mkdir(parents=True)
+    (one.folder / "config.yaml").write_text(content)
+    with pytest.raises(ValueError, match=r"config\.yaml is not the configuration of a run"):
+        check_folder(one, force=False)
+    check_folder(one, force=True)

@@ -1,6 +1,7 @@
 """Worker processes that end with their parent process."""
 
 import os
+import signal
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
@@ -8,9 +9,13 @@ from multiprocessing import get_context, parent_process
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
     """Return a context for new processes, which do not inherit any state."""
-    return ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=end_with_parent
-    )
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
+
+
+def _begin() -> None:
+    end_with_parent()
+    # A terminal sends Ctrl-C to all processes. The parent reports it; a worker ends without a word.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def end_with_parent() -> None:

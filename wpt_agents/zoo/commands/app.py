@@ -3,6 +3,7 @@
 Imports are inside the commands so that `--help` answers at once.
 """
 
+import os
 import sys
 import traceback
 from typing import Annotated
@@ -37,6 +38,10 @@ All commands: python -m wpt_agents.zoo --help. One command: python -m wpt_agents
 PROGRAM = "python -m wpt_agents.zoo"
 DEBUG = "--debug"
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C ended; typer returns it, too
+# Errors whose messages say what to do: wrong values, files, packages, a loss that is not finite.
+OF_USERS = (ValueError, OSError, ImportError, FloatingPointError)
+# The first versions of Python without the simulators, as in pyproject.toml.
+UNAVAILABLE_FROM = {"dm_control": (3, 13), "metaworld": (3, 14), "gymnasium_robotics": (3, 14)}
 
 app = typer.Typer(
     add_completion=False,
@@ -81,9 +86,12 @@ def main() -> None:
     words = [word for word in sys.argv[1:] if word != DEBUG]
     try:
         code = app(words, prog_name=PROGRAM, standalone_mode=False)  # typer raises its errors
+        sys.stdout.flush()
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and reader_is_gone():
+            sys.exit(1)
         if len(words) < len(sys.argv) - 1:
             traceback.print_exc()
         message, code = explain(error)
@@ -95,16 +103,36 @@ def main() -> None:
     sys.exit(code or 0)
 
 
+def reader_is_gone() -> bool:
+    """Return whether nobody reads the output any more, as after `| head`; then discard the rest."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes at exit
+        return True
+    return False
+
+
 def explain(error: Exception) -> tuple[str, int]:
     """Return the sentence that describes an error, and the exit code."""
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("wpt_"):
-        return f'{error.name} is not installed: pip install "wpt-agents[all]"', 2
+        return missing(error.name or str(error)), 2
     if hasattr(error, "format_message"):  # typer's error for a wrong option or value
         context = getattr(error, "ctx", None)
         command = context.command_path if context else PROGRAM
         sentence = error.format_message().replace("Value error, ", "").rstrip(".")
         return sentence and f"{sentence} (see {command} --help)", 2
-    if isinstance(error, (ValueError, OSError)):
+    kind = type(error)
+    of_user = isinstance(error, OF_USERS) and not isinstance(error, ModuleNotFoundError)
+    if of_user or kind.__module__.startswith("wpt_envs."):
         return str(error), 2
-    kind = type(error).__name__
-    return f"{kind}: {error} (add {DEBUG} to see where, and please report it)", 1
+    return f"{kind.__name__}: {error} (add {DEBUG} to see where, and please report it)", 1
+
+
+def missing(package: str) -> str:
+    """Return the sentence that says how to get a package that is not installed."""
+    end = UNAVAILABLE_FROM.get(package)
+    if end is not None and sys.version_info[:2] >= end:
+        newest = f"{end[0]}.{end[1] - 1}"
+        return f"{package} cannot be installed on this version of Python: use {newest} or older"
+    return f'{package} is not installed: pip install "wpt-agents[all]"'

@@ -4,7 +4,7 @@ Imports are inside the commands so that `--help` answers at once.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -17,10 +17,13 @@ from wpt_agents.zoo.commands.retrieval import (
     show_retrieval,
 )
 
-if TYPE_CHECKING:
-    pass
 
-data = typer.Typer(no_args_is_help=True, help="Show, check and join datasets.")
+HELP = """\
+Show, check and join datasets.
+
+Example: `python -m wpt_agents.zoo data show data/two`
+"""
+data = typer.Typer(no_args_is_help=True, help=HELP)
 Store = Annotated[Path, typer.Argument(help="The folder of a dataset.")]
 
 
@@ -104,7 +107,7 @@ def collect_data(
     The defaults are the paper's: in metaworld 200 episodes of scripted policies for each of 50
     tasks and 5 strengths of noise, in dmc 2000 episodes of each of 5 robots.
 
-    Example: `python -m wpt_agents.zoo collect --tasks walker-run --behaviour icm --out data`
+    Example: `python -m wpt_agents.zoo collect --tasks walker-run --episodes 30 --out data/noise`
     """
     from wpt_agents.zoo.collect.collection import collect
     from wpt_agents.zoo.plan.presets import (

@@ -7,7 +7,12 @@ import typer
 
 from wpt_agents.zoo.commands.options import Rendering, Suite
 
-retrieve = typer.Typer(no_args_is_help=True, help="Show or measure what retrieval finds.")
+HELP = """\
+Show or measure what retrieval finds.
+
+Example: `python -m wpt_agents.zoo retrieve show data/two --model model.zip`
+"""
+retrieve = typer.Typer(no_args_is_help=True, help=HELP)
 
 
 Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
@@ -15,7 +20,7 @@ Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 
 def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
-    model: Annotated[Path, typer.Option(help="The model file whose encoder compares the images.")],
+    model: Annotated[Path, typer.Option(help="The model, a file or a name, whose encoder compares the images.")],
     query: Annotated[
         list[int], typer.Option(help="Numbers of trajectories whose first images to search for.")
     ] = [],  # noqa: B006

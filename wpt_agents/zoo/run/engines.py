@@ -7,7 +7,7 @@ file system that all machines share. Ray and submitit are imported only when nee
 
 import shutil
 import signal
-import traceback
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -101,13 +101,9 @@ def _at_absolute_paths(job: Run) -> Run:
 def make_shared(job: Run) -> None:
     """Execute the shared stages of `job`, with their output in the cache's `log.txt`."""
     with logged(job.shared.log):
-        try:
-            dataset = collect_data(job.shared)
-            if job.algorithm.pretrained:
-                pretrain(job.shared, dataset)
-        except Exception:
-            traceback.print_exc()
-            raise
+        dataset = collect_data(job.shared)
+        if job.algorithm.pretrained:
+            pretrain(job.shared, dataset)
 
 
 def do(job: Run) -> None:
@@ -144,8 +140,7 @@ class Local:
                     if code < 0 and deaths[job.folder] <= self.resources.retries:
                         waiting.append(job)
                     elif code:
-                        shared = work is make_shared
-                        trace = job.shared.log if shared else job.folder / "error.txt"
+                        trace = job.shared.log if work is make_shared else trace_of(job.folder)
                         errors[job.folder] = why(trace, code)
         finally:
             for process in running:
@@ -168,7 +163,16 @@ def _in_process(work: Work, job: Run, cpus: int) -> None:
 
 def _in_child(work: Work, job: Run, cpus: int) -> None:
     end_with_parent()
-    _in_process(work, job, cpus)
+    try:
+        _in_process(work, job, cpus)
+    except (Exception, KeyboardInterrupt):  # the job's log has the traceback; the parent reports it
+        sys.exit(1)
+
+
+def trace_of(folder: Path) -> Path:
+    """Return the file with the traceback of a failed run: its log if it failed before it began."""
+    error = folder / "error.txt"
+    return error if error.exists() else folder / "log.txt"
 
 
 def why(trace: Path, code: int) -> str:

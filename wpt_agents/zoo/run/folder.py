@@ -53,7 +53,7 @@ def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool)
         section = job.algorithm.section
         keywords = {section: dict(defaults(job.algorithm.agent))}
         usual = _flat(Preset().as_dict() | keywords)  # for keys that older versions do not have
-        before = usual | _flat(yaml.safe_load(path.read_text(encoding="utf-8")))
+        before = usual | _flat(_stored(path))
         now = usual | _flat(json.loads(json.dumps(config)))
         differ = sorted(k for k in before.keys() | now if before.get(k) != now.get(k))
         if differ:
@@ -61,6 +61,17 @@ def check_config(folder: Path, config: Mapping[str, Any], job: Run, force: bool)
                 f"{folder} holds a run with other settings ({', '.join(differ)}); "
                 "use another --out, or --force to replace it"
             )
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """Read the settings that a run folder was made with."""
+    try:
+        return dict(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is not the configuration of a run ({error!r}); use another --out, or --force "
+            "to replace it"
+        ) from None
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -108,6 +108,15 @@ def prepare(app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = outward_links(text, path.parent)
 
 
+def headings(
+    app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]
+) -> None:
+    """Turn the Markdown headings of a docstring, which are Gymnasium's form, into headings here."""
+    text = "\n".join(lines)
+    lines[:] = re.sub(r"^## (.*)$", r".. rubric:: \1\n", text, flags=re.M).split("\n")
+
+
 def setup(app: Sphinx) -> None:
-    """Connect the preparation of pages."""
+    """Connect the preparation of pages and of docstrings."""
     app.connect("source-read", prepare)
+    app.connect("autodoc-process-docstring", headings)

@@ -5,6 +5,7 @@ import csv
 import inspect
 import json
 import re
+import runpy
 import shlex
 from importlib import import_module
 from pathlib import Path
@@ -161,3 +162,30 @@ def test_every_option_of_import_is_on_its_page():
     options = {name for item in command.params for name in item.opts if name.startswith("--")}
     page = PAGES["docs/importing.md"]
     assert not {name for name in options - {"--help"} if f"`{name}`" not in page}
+
+
+def test_the_headings_of_docstrings_are_headings_on_the_site():
+    pytest.importorskip("sphinx", reason='needs `pip install -e ".[docs]"`')
+    headings = runpy.run_path(str(ROOT / "docs" / "conf.py"))["headings"]
+    lines = ["A task.", "", "## Rewards", "0 to 1."]
+    headings(None, "class", "wpt_envs.dmc.DMControl", None, None, lines)
+    assert lines == ["A task.", "", ".. rubric:: Rewards", "", "0 to 1."]
+
+
+def undocumented(thing):
+    names = (n for n in inspect.signature(thing).parameters if n != "self" and n[0] != "_")
+    return [name for name in names if f":param {name}:" not in thing.__doc__]
+
+
+WPTS = re.search(r"autoclass:: wpt_agents.WPT\n +:members: (.*)", PAGES["docs/api/public.md"])[1]
+DATASETS = [name for name in dir(wpt_agents.TrajectoryDataset) if name[0] != "_"]
+METHODS_OF = {"WPT": WPTS.split(", "), "TrajectoryDataset": DATASETS}
+
+
+@pytest.mark.parametrize("name", wpt_agents.__all__)
+def test_every_parameter_of_a_public_name_is_documented(name):
+    thing = getattr(wpt_agents, name)
+    if name != "TrajectoryDataset":  # which is made by `create`, `open` and so on
+        assert not undocumented(thing)
+    members = {method: getattr(thing, method) for method in METHODS_OF.get(name, [])}
+    assert not {n: undocumented(m) for n, m in members.items() if callable(m) and undocumented(m)}

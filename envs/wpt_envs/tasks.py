@@ -50,15 +50,24 @@ _ROBOTICS = {
 
 @dataclass(frozen=True)
 class Task:
-    """A task of a suite, which is one row of the table."""
+    """A task of a suite, which is one row of the table.
+
+    :param suite: "dmc", "metaworld" or "robotics"
+    :param name: its name in the suite, such as "walker-run"
+    :param embodiment: the robot
+    :param action_dim: the robot's number of actions, without padding
+    :param frames: control steps of an episode, before any action repeat
+    :param metric: "return", or "success" at the last step
+    :param in_paper: whether it is one of the paper's 22 + 50 tasks
+    """
 
     suite: str
     name: str
     embodiment: str
-    action_dim: int  # true width, without padding
-    frames: int  # control steps per episode, before any action repeat
-    metric: str  # "return", or "success" at the last step
-    in_paper: bool  # one of the paper's 22 + 50 tasks
+    action_dim: int
+    frames: int
+    metric: str
+    in_paper: bool
 
     @property
     def id(self) -> str:

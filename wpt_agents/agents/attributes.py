@@ -1,7 +1,7 @@
 """Keywords and counters, declared once in dataclasses, as an agent's attributes and signature."""
 
 import inspect
-import textwrap
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -138,11 +138,18 @@ def declare(
         attribute.__set_name__(agent, name)  # Python calls it only for attributes in a class's body
         setattr(agent, name, attribute)
     agent.__signature__ = signature(keywords, init)  # type: ignore[attr-defined]
-    text = agent.__dict__.get("__doc__")
-    if text:
-        indented = textwrap.indent(keywords.documentation(), "    ")
+    if text := inspect.cleandoc(agent.__dict__.get("__doc__") or ""):
+        if ":param policy:" in text and ":param env:" not in text:
+            text += f"\n{common_parameters(agent)}"
         gap = "\n" if ":param" in text else "\n\n"  # a list of parameters stands apart
-        agent.__doc__ = f"{text.rstrip()}{gap}{indented}\n    "
+        agent.__doc__ = f"{text}{gap}{keywords.documentation()}\n"
+
+
+def common_parameters(agent: type) -> str:
+    """Return the documentation of `env` and all else that every agent takes, from a base class."""
+    documents = (base.__doc__ or "" for base in agent.__mro__[1:])
+    matches = (re.search(r":param env:.*?:param device:[^\n]*", text, re.S) for text in documents)
+    return next(match[0] for match in matches if match)
 
 
 def signature(keywords: type[Keywords], init: Callable[..., None]) -> inspect.Signature:

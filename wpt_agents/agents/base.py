@@ -293,12 +293,17 @@ class PixelAgent(SavedAgent):
         self.logger.dump(step=self.num_timesteps)
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:
-        """Write the collected episodes to one file, which `load_replay_buffer` reads."""
+        """Write the collected episodes to one file, which `load_replay_buffer` reads.
+
+        :param path: the file, which is replaced if it exists; missing folders are made
+        :raises OSError: a folder that cannot be written to, or a full disk
+        """
         self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | os.PathLike[str]) -> None:
         """Replace the replay buffer by the episodes in a file of `save_replay_buffer`.
 
+        :param path: the file
         :raises ValueError: a file that is cut short, damaged, or not a replay buffer
         """
         self.replay_buffer = ReplayBuffer.load(path)

@@ -35,8 +35,8 @@ class SavedAgent(KeywordAgent):
 
     :param policy: the policy's name or class; the first of `policy_aliases` if None
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param dataset: trajectories to learn from: a `TrajectoryDataset`, the path of one or of files
-        in another format, a replay buffer, trajectories, or a list of these
+    :param dataset: trajectories, for agents that learn from any: a `TrajectoryDataset`, the path of
+        one or of files in another format, a replay buffer, trajectories, or a list of these
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 for nothing, 1 for information
     :param device: "auto", "cpu", "cuda", ...
@@ -131,7 +131,11 @@ class SavedAgent(KeywordAgent):
     # Data and environments
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another dataset from now on, of any kind that the keyword `dataset` takes."""
+        """Use another dataset from now on.
+
+        :param dataset: any kind that the keyword `dataset` takes; None changes nothing
+        :raises ValueError: something that is no dataset, or data that the agent cannot learn from
+        """
         if dataset is not None:
             opened = open_dataset(dataset)
             self.check_data(opened)
@@ -201,9 +205,10 @@ class SavedAgent(KeywordAgent):
     ) -> None:
         """Write the model file: weights, optimisers, keywords and counters, but no episodes.
 
-        :param path: the suffix .zip is added where there is none
+        :param path: the file; missing folders are made, and .zip is added where there is no suffix
         :param exclude: ignored; accepted because SB3 has it
         :param include: ignored; accepted because SB3 has it
+        :raises OSError: a folder that cannot be written to, or a full disk
         """
         dataset = None if self.dataset is None else str(self.dataset.path)
         header = self.description() | {"dataset": dataset}
@@ -294,7 +299,13 @@ class SavedAgent(KeywordAgent):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """Load weights and optimisers in place, from a model file or from `get_parameters`."""
+        """Load weights and optimisers in place.
+
+        :param load_path_or_dict: a model file, or what `get_parameters` returns
+        :param exact_match: refuse a dictionary that lacks parts of the agent or has others
+        :param device: the device of the tensors of a dictionary
+        :raises ValueError: a file that is damaged or of another agent, or other parts
+        """
         if isinstance(load_path_or_dict, dict):
             self.fit_networks(load_path_or_dict.get("policy", {}))
             # A copy, as torch lets two optimisers share the averages that one hands to the other.

@@ -271,6 +271,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def build_index(self, progress_bar: bool = False) -> Retriever:
         """Return the index of the dataset's first images, which is kept beside the dataset.
 
+        :param progress_bar: show a progress bar
         :raises ValueError: the agent has no dataset
         """
         if self.dataset is None:
@@ -336,6 +337,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
 
         Actor, critic, target critic and reward head are written, too, trained or not.
 
+        :param path: the file
         :raises ValueError: a model whose `Size` has other `gates` or `norm_eps` than the authors'
         """
         export_model(self.policy, path)

@@ -302,8 +302,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     # The data and the task
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another D_off, of any kind that the keyword `dataset` takes; None changes nothing.
+        """Use another D_off from now on.
 
+        :param dataset: any kind that the keyword `dataset` takes; None changes nothing
         :raises ValueError: a dataset with other images, wider actions or too short trajectories
         """
         super().set_dataset(dataset)

@@ -50,6 +50,7 @@ def open_dataset(data: Data) -> TrajectoryDataset:
     - A replay buffer, a Trajectory, or an iterable of Trajectories: stored in a temporary folder.
     - A list of any of these: a view of all as one dataset.
 
+    :param data: one of these
     :raises ValueError: anything else; the message says what it is and what to do
     """
     if isinstance(data, TrajectoryDataset):
@@ -156,6 +157,9 @@ def from_episodes(
 ) -> TrajectoryDataset:
     """Convert episodes into a dataset at `path`; an interrupted conversion continues.
 
+    :param episodes: trajectories by number, such as a reader of a format
+    :param path: the folder of the dataset
+    :param progress_bar: show a progress bar
     :raises ValueError: the dataset there does not begin with these episodes, or an episode cannot
         be converted; those before it are kept
     """
@@ -234,8 +238,12 @@ def convert(
 ) -> TrajectoryDataset:
     """Convert data in another format at `source` into a dataset at `path`.
 
+    :param source: a file, a folder, a name or a replay buffer, depending on the format
+    :param path: the folder of the dataset
+    :param progress_bar: show a progress bar
     :param form: a name in `FORMATS`; recognised by default
     :param options: keywords of the format's reader, such as `image_key` or `low` and `high`
+    :raises ValueError: data or options that cannot be used, or another dataset at `path`
     """
     return from_episodes(open_episodes(source, form, **options), path, progress_bar)
 

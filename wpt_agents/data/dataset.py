@@ -88,6 +88,7 @@ class TrajectoryDataset(StoredTrajectories):
     ) -> "TrajectoryDataset":
         """Make an empty dataset in a new or empty folder.
 
+        :param path: the folder
         :param image_size: height and width of the images, to which others are resized
         :param codec: "zstd" (lossless, a sixth of the size for simulated images), "raw", or "jpeg"
             (lossy, a fourth of the size; for camera images, whose noise zstd cannot compress)
@@ -102,6 +103,7 @@ class TrajectoryDataset(StoredTrajectories):
     def open(cls, path: Source, workers: int = 0) -> "TrajectoryDataset":
         """Open a dataset. Only its index is read; trajectories that were set aside are left out.
 
+        :param path: the folder
         :param workers: number of threads that decompress
         :raises ValueError: there is no dataset, it is of a newer version, or its index is damaged
         """
@@ -114,6 +116,8 @@ class TrajectoryDataset(StoredTrajectories):
     def open_or_create(cls, path: Source, image_size: int = IMAGE_SIZE) -> "TrajectoryDataset":
         """Open the dataset at `path`, or make an empty one where there is none.
 
+        :param path: the folder
+        :param image_size: height and width of the images of a new dataset
         :raises ValueError: as `open` and `create`
         """
         there = (Path(path).expanduser() / "meta.json").exists()
@@ -131,6 +135,9 @@ class TrajectoryDataset(StoredTrajectories):
 
         It has their codec, or the lossless "zstd" if their codecs differ.
 
+        :param path: a new or empty folder
+        :param datasets: datasets or their folders
+        :param workers: number of threads that decompress
         :param image_size: resize the images to this size; required if the datasets' sizes differ
         :raises ValueError: no datasets, images of different sizes, a folder that is not empty, or a
             damaged trajectory; those before it are kept
@@ -155,6 +162,7 @@ class TrajectoryDataset(StoredTrajectories):
     def join(cls, datasets: Sequence["TrajectoryDataset"]) -> "TrajectoryDataset":
         """Return a read-only view of several datasets as one; nothing is copied.
 
+        :param datasets: at least one
         :raises ValueError: no datasets, or images of different sizes
         """
         if not datasets:
@@ -185,6 +193,7 @@ class TrajectoryDataset(StoredTrajectories):
 
         Images of another size are resized, with one warning for each size.
 
+        :param trajectory: with images of any size, as `Trajectory` describes them
         :param crop: cut out the middle square of images that are not square, instead of squeezing
         :raises ValueError: non-zero numbers in the actions' padding, a read-only view, or another
             process that writes
@@ -206,6 +215,9 @@ class TrajectoryDataset(StoredTrajectories):
 
         Trajectories of another dataset with the same codec are copied as they are stored: checked,
         but not decoded.
+
+        :param trajectories: another dataset, or any trajectories
+        :raises ValueError: as `append`, or a damaged trajectory of the other dataset
         """
         if isinstance(trajectories, TrajectoryDataset):
             metas = {folder.meta for folder in trajectories._folders}
@@ -279,6 +291,7 @@ class TrajectoryDataset(StoredTrajectories):
     def validate(self, progress_bar: bool = False, set_aside: bool = False) -> list[Damage]:
         """Read every byte and list the damaged trajectories.
 
+        :param progress_bar: show a progress bar
         :param set_aside: exclude the damaged ones, here and for everybody who opens the folder from
             now on; the trajectories after them move up in number. The file `damaged.json` in the
             folder lists them; delete it to include them again

@@ -148,7 +148,11 @@ class StoredTrajectories:
         return view
 
     def first_observations(self, batch: int = 1024) -> Iterator[np.ndarray]:
-        """Yield all first images, in order: (n, S, S, 3) uint8 with n <= `batch` each time."""
+        """Yield all first images, in order.
+
+        :param batch: number of images at a time, at most
+        :return: (n, S, S, 3) uint8 with n <= `batch`
+        """
         for at in range(0, len(self), batch):
             chunk = range(at, min(at + batch, len(self)))
             yield np.stack(list(self._threads.map(self._first_image, chunk)))

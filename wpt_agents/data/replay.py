@@ -35,6 +35,7 @@ class ReplayBuffer:
     def add(self, trajectory: Trajectory) -> None:
         """Append one episode, without copying it.
 
+        :param trajectory: an episode, or a part of a long one
         :raises ValueError: images of another size than those already here
         """
         size = trajectory.image.shape[1:]
@@ -56,6 +57,11 @@ class ReplayBuffer:
     ) -> Batch:
         """Draw a batch by the rule of `wpt_agents.data.windows`.
 
+        :param batch_size: B, number of sequences
+        :param length: T, number of images in a sequence
+        :param action_width: A, width to which actions are padded
+        :param rng: source of the random numbers
+        :return: (B, T) sequences
         :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
         """
         rows = self.draw(batch_size, length, rng)
@@ -77,7 +83,10 @@ class ReplayBuffer:
         return [[(before + i, start, stop) for i, start, stop in row] for row in rows]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one file (arrays and JSON, no pickle) atomically."""
+        """Write one file (arrays and JSON, no pickle) atomically.
+
+        :param path: the file
+        """
         episodes = [{k: getattr(t, k) for k in LABELS} for t in self.trajectories]
         arrays = {
             f"{i}/{name}": getattr(trajectory, name)
@@ -91,6 +100,7 @@ class ReplayBuffer:
     def load(cls, path: str | os.PathLike[str]) -> "ReplayBuffer":
         """Read a file of `save`.
 
+        :param path: the file
         :raises ValueError: a file that is cut short, damaged, or not a replay buffer
         """
         head, arrays = load_arrays(path, "ReplayBuffer")
@@ -116,9 +126,18 @@ def mix(
 
     The rewards of `retrieved` belong to other tasks or to none, so they are masked.
 
+    :param online: the task's episodes
+    :param retrieved: the retrieved trajectories, None for no rehearsal
+    :param ratio: share of the rows that are retrieved, in [0, 1]
+    :param batch_size: B, number of sequences
+    :param length: T, number of images in a sequence
+    :param action_width: A, width to which actions are padded
+    :param rng: source of the random numbers
     :param recent_share: share of the online rows that come from the newest episodes, which uniform
         replay shows least often
     :param mark: return a `MarkedBatch`, which marks what moves
+    :return: (B, T) sequences
+    :raises ValueError: a ratio outside [0, 1]
     """
     if not 0 <= ratio <= 1:
         raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")

@@ -58,7 +58,10 @@ class Retriever:
     ) -> "Retriever":
         """Embed the first image of every trajectory.
 
+        :param dataset: the trajectories
         :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
+        :param encoder_id: which encoder `embed` is, such as a hash of its weights
+        :param progress_bar: show a progress bar
         """
         features, at = np.zeros((len(dataset), 0), np.float32), 0
         with StageBar(len(dataset), "index", progress_bar) as bar:
@@ -87,6 +90,11 @@ class Retriever:
         """Load the index in the dataset's folder; build it if missing, damaged or out of date.
 
         The index of a subset is built each time, since the folder holds that of the whole dataset.
+
+        :param dataset: the trajectories
+        :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
+        :param encoder_id: which encoder `embed` is, such as a hash of its weights
+        :param progress_bar: show a progress bar
         """
         # Named by its encoder, so that models do not overwrite each other's index.
         path = Path(dataset.path) / f"retrieval-{encoder_id[:12]}.index"
@@ -121,6 +129,7 @@ class Retriever:
 
         :param embed: (E,), the features of the task's first observation, or (Q, E), those of the
             first observations of Q episodes, which take their nearest trajectories in turns
+        :param k: number of trajectories
         :param embodiment: only trajectories of this name, or of none
         :param action_dim: only trajectories of this action width
         :return: indices (k',) and distances (k',) to the query that found each, nearest first (of
@@ -158,13 +167,21 @@ class Retriever:
         embodiment: str | None = None,
         action_dim: int | None = None,
     ) -> np.ndarray:
-        """Draw `k` of the candidates of `search` at random, without replacement."""
+        """Draw `k` of the candidates of `search` at random, without replacement.
+
+        :param k: number of trajectories
+        :param rng: source of the random numbers
+        :param embodiment: only trajectories of this name, or of none
+        :param action_dim: only trajectories of this action width
+        :return: indices (k',); k' < k if there are no more
+        """
         candidates = self._candidates(embodiment, action_dim)
         return rng.permutation(candidates)[:k]
 
     def own_share(self, k: int = 10, queries: int = 100) -> float | None:
         """Measure how well the features alone distinguish robots.
 
+        :param k: number of neighbours
         :param queries: how many named trajectories to search for, evenly spread
         :return: the share of their `k` nearest named others that are of the same name; None where
             fewer than two robots are named
@@ -189,7 +206,10 @@ class Retriever:
         return np.flatnonzero(fits)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one file atomically."""
+        """Write one file atomically.
+
+        :param path: the file
+        """
         head = {
             "encoder_id": self.encoder_id,
             "dataset_id": self.dataset_id,
@@ -202,6 +222,8 @@ class Retriever:
     def load(cls, path: str | os.PathLike[str], encoder_id: str) -> "Retriever":
         """Read a file of `save`.
 
+        :param path: the file
+        :param encoder_id: which encoder the features must be of
         :raises ValueError: an index of another encoder, or a damaged file
         """
         head, arrays = load_arrays(path, "Retriever")

@@ -108,8 +108,6 @@ def test_the_table_of_the_paper_names_what_exists():
         assert callable(resolve_name(f"wpt_agents.{name}")), name
 
 
-
-
 def test_every_task_and_keyword_that_is_named_exists():
     for page in (README, *PAGES.values()):
         assert set(re.findall(r"wpt/[a-z-]+-v0", page)) <= TASKS.keys()

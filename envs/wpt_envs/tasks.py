@@ -107,7 +107,12 @@ ANT_SEQUENCE: tuple[str, ...] = tuple(
 
 
 def suite(name: str, paper_only: bool = True) -> list[Task]:
-    """Return the tasks of one suite, in the table's order."""
+    """Return the tasks of one suite, in the table's order.
+
+    :param name: "dmc", "metaworld" or "robotics"
+    :param paper_only: leave out tasks that are not in the paper
+    :raises ValueError: an unknown suite
+    """
     rows = [task for task in TASKS.values() if task.suite == name]
     if not rows:
         suites = sorted({task.suite for task in TASKS.values()})
@@ -121,7 +126,10 @@ def suite_width(name: str) -> int:
 
 
 def pad_width(suite_name: str, pad_action_to: int | str | None) -> int | None:
-    """Return the width that `pad_action_to` stands for."""
+    """Return the width that `pad_action_to` stands for.
+
+    :raises ValueError: anything but a number, "suite" and None
+    """
     if pad_action_to == "suite":
         return suite_width(suite_name)
     if pad_action_to is None or isinstance(pad_action_to, int):
@@ -130,7 +138,10 @@ def pad_width(suite_name: str, pad_action_to: int | str | None) -> int | None:
 
 
 def find(suite_name: str, name: str) -> Task:
-    """Return the row of a task; the error for an unknown name lists the nearest ones."""
+    """Return the row of a task.
+
+    :raises ValueError: an unknown name; the message lists the nearest ones
+    """
     task = TASKS.get(f"wpt/{suite_name}-{name}-v0")
     if task is None:
         names = [row.name for row in suite(suite_name, paper_only=False)]

@@ -259,6 +259,8 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         :param run_dir: folder of `model.zip`, which is written every 1,000 updates, at the end, and
             on Ctrl-C or SIGTERM, and of the learning curve, `progress.csv` and TensorBoard events.
             If a model is there, training continues from it
+        :param seed: seed of all random numbers; None: a random seed
+        :param progress_bar: show a progress bar
         :param callback: called after every update with (step, metrics)
         :param accumulate: must be 1; accepted because `WPT.pretrain` has it
         :param kwargs: keywords of `R3M`

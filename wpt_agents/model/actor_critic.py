@@ -30,6 +30,8 @@ def lambda_return(
 
     :param reward: (B, H), predicted at the imagined steps 0 .. H-1
     :param value: (B, H + 1), the critic's means at the steps 0 .. H
+    :param gamma: γ, the discount factor
+    :param lam: λ, the weight of the longer returns
     :param goes_on: (B, H), c; 1 everywhere if None
     :return: (B, H), the targets of Eq. (3)
     """
@@ -80,6 +82,7 @@ def critic_loss(
 
     :param logits: (B, H, bins), of detached states
     :param lambda_return: (B, H); no gradient reaches it
+    :param gamma: γ of the weights
     :param goes_on: (B, H), c of `lambda_return`: steps that dreams hardly reach weigh less
     :param bin_range: of the bins, in symlog space
     """
@@ -104,6 +107,8 @@ def actor_loss(
 
     :param lambda_return: (B, H), with its gradient through the dynamics
     :param entropy: (B, H), of the actor at the steps 0 .. H-1
+    :param ent_coef: η, the weight of the entropy in nats
+    :param gamma: γ of the weights
     :param return_scale: divides the returns; 1 in the paper
     :param goes_on: (B, H), c of `lambda_return`: an action counts if the episode goes on after it
     """

@@ -171,7 +171,7 @@ class TruncatedNormal:
         return self.mean * self.mask
 
     def rsample(self, generator: Noise = None) -> Tensor:
-        """Draw by the inverse of the cumulative distribution, differentiable in mean and std."""
+        """Draw by the inverse of the cumulative distribution, with a gradient: (..., A)."""
         cdf = self.low_cdf + uniform(self.mean, generator) * self.mass
         # clamped because erfinv is infinite at -1 and 1
         z = SQRT2 * torch.erfinv((2 * cdf - 1).clamp(-1 + 1e-6, 1 - 1e-6))

@@ -18,7 +18,7 @@ class EnsembleLinear(nn.Module):
             nn.init.xavier_uniform_(matrix.data)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Member k's layer acts on x[k]."""
+        """Member k's layer acts on x[k]: (K, N, inputs) -> (K, N, outputs)."""
         return torch.baddbmm(self.bias, x, self.weight)
 
 
@@ -31,7 +31,7 @@ class EnsembleNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(members, 1, width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Member k's norm acts on x[k]."""
+        """Member k's norm acts on x[k]: (K, N, W) -> (K, N, W)."""
         return F.layer_norm(x, x.shape[-1:]) * self.weight + self.bias
 
 

@@ -111,7 +111,7 @@ class ValuePair(nn.Module):
 
 
 def normed(x: Tensor) -> Tensor:
-    """Layer norm without weights, over the last axis."""
+    """Layer norm without weights, over the last axis: (..., W) -> (..., W)."""
     return F.layer_norm(x, x.shape[-1:])
 
 
@@ -124,7 +124,7 @@ def xavier_relu(module: nn.Module) -> None:
 
 
 def reward_bins(device: torch.device | str = "cpu") -> Tensor:
-    """The values of the bins: symexp of BINS even steps over [-10, 10]."""
+    """The values of the bins, (BINS,): symexp of even steps over [-10, 10]."""
     return symexp(torch.linspace(-10, 10, BINS, device=device))
 
 

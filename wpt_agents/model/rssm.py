@@ -166,7 +166,16 @@ class RSSM(nn.Module):
         generator: Noise = None,
         sample: bool = True,
     ) -> tuple[Latent, Tensor]:
-        """`observe` without the prior, which acting does not need."""
+        """`observe` without the prior, which acting does not need.
+
+        :param embed: (B, T, E)
+        :param action: (B, T, A), what led to each image
+        :param is_first: (B, T) bool
+        :param state: the latent before the first step, of B rows; zeros if None
+        :param generator: source of the random numbers
+        :param sample: draw z; False takes the most likely classes
+        :return: the posterior latents and their logits (B, T, S, K)
+        """
         batch, length = is_first.shape
         assert embed.shape[:2] == action.shape[:2] == (batch, length), (embed.shape, action.shape)
         keep = (~is_first[..., None]).to(embed.dtype)

@@ -236,7 +236,7 @@ class WorldModel(nn.Module):
         return error.view(image.shape[:2])
 
     def batch_error(self, latent: Latent, batch: Batch, pixel_weight: float = 1.0) -> Tensor:
-        """Return the `reconstruction_error` of states, weighted where a MarkedBatch says so."""
+        """Return `reconstruction_error` (B, T), weighted where a MarkedBatch says so."""
         moving = batch.moving if isinstance(batch, MarkedBatch) else None
         return self.reconstruction_error(latent, batch.image, moving, pixel_weight)
 

@@ -88,6 +88,8 @@ def collect(
         images, or the simulator's state if it was trained on states
     :param settings: keywords of WPT for a curious agent, in addition to `curious.EXPLORE`; `steps`
         of "explore-state"
+    :return: the dataset at `path`
+    :raises ValueError: names, options or settings that do not fit, or another collection at `path`
     """
     tasks = [tasks] if isinstance(tasks, str) else list(tasks)
     _check(tasks, episodes, behaviour, policy)

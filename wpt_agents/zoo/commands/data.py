@@ -17,7 +17,6 @@ from wpt_agents.zoo.commands.retrieval import (
     show_retrieval,
 )
 
-
 HELP = """\
 Show, check and join datasets.
 

@@ -20,7 +20,9 @@ Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 
 def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
-    model: Annotated[Path, typer.Option(help="The model, a file or a name, whose encoder compares the images.")],
+    model: Annotated[
+        Path, typer.Option(help="The model, a file or a name, whose encoder compares the images.")
+    ],
     query: Annotated[
         list[int], typer.Option(help="Numbers of trajectories whose first images to search for.")
     ] = [],  # noqa: B006

@@ -1,9 +1,7 @@
 """How the command line starts, helps and fails."""
 
-import os
 import re
 import shlex
-import sys
 import tomllib
 from pathlib import Path
 
@@ -169,12 +167,3 @@ def test_a_simulator_that_this_python_cannot_have_is_named_with_the_newest_that_
     sentence = "dm_control cannot be installed on this version of Python: use 3.12 or older"
     assert command_line.missing("dm_control") == sentence
     assert command_line.missing("metaworld").endswith('pip install "wpt-agents[all]"')
-
-
-def test_a_reader_that_leaves_early_ends_the_command_without_a_word(monkeypatch, capfd):
-    reader, writer = os.pipe()
-    os.close(reader)
-    with open(writer, "w", encoding="utf-8") as output:
-        monkeypatch.setattr(sys, "stdout", output)
-        assert call(monkeypatch) == 1
-    assert capfd.readouterr().err == ""

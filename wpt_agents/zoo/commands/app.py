@@ -3,7 +3,6 @@
 Imports are inside the commands so that `--help` answers at once.
 """
 
-import os
 import sys
 import traceback
 from typing import Annotated
@@ -86,12 +85,9 @@ def main() -> None:
     words = [word for word in sys.argv[1:] if word != DEBUG]
     try:
         code = app(words, prog_name=PROGRAM, standalone_mode=False)  # typer raises its errors
-        sys.stdout.flush()
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and reader_is_gone():
-            sys.exit(1)
         if len(words) < len(sys.argv) - 1:
             traceback.print_exc()
         message, code = explain(error)
@@ -101,16 +97,6 @@ def main() -> None:
         again = "without --force" if "--force" in words else "from the finished stages"
         typer.echo(f"Interrupted. The same command continues {again}.", err=True)
     sys.exit(code or 0)
-
-
-def reader_is_gone() -> bool:
-    """Return whether nobody reads the output any more, as after `| head`; then discard the rest."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes at exit
-        return True
-    return False
 
 
 def explain(error: Exception) -> tuple[str, int]:

@@ -379,6 +379,8 @@ def test_reward_head_and_critic_have_the_bins_of_their_keyword(tmp_path):
     assert WPT.load(tmp_path / "model").policy.critic.bin_range == 7.0
     with pytest.raises(ValueError, match=r"trained with bin_range=7\.0, now it is 20"):
         WPT.load(tmp_path / "model", bin_range=20.0)
+    with pytest.raises(ValueError, match=r"trained with bin_range=7\.0, now it is 20"):
+        agent().set_parameters(tmp_path / "model")
     with pytest.raises(ValueError, match="bin_range must be a number above 0"):
         agent(bin_range=0)
 

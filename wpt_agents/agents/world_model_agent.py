@@ -23,7 +23,6 @@ from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.data.units import compare_units
 from wpt_agents.fast.compiled import compile_loops
-from wpt_agents.model.distributions import BIN_RANGE
 from wpt_agents.model.observations import State
 from wpt_agents.model.ops import definitions
 from wpt_agents.model.policy import WPTPolicy
@@ -137,7 +136,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         tensors: Mapping[str, Mapping[str, Tensor]],
         same: tuple[str, ...],
     ) -> None:
-        """Take over a model file. Heads that have learned need the bins that they learned with.
+        """Take over a model file.
 
         Of a file that holds a world model alone, the counters of the task begin again, too.
         """
@@ -145,12 +144,13 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             before = self.progress_class.of(header["counters"])
             kept = {name: getattr(before, name) for name in ("pretrain_steps", "initialised")}
             header = {**header, "counters": self.progress_class(**kept).as_dict()}
-        if header["counters"].get("updates"):
-            same = (*same, "bin_range")
-            keywords = {"bin_range": BIN_RANGE} | header["hyperparameters"]  # not in older files
-            header = {**header, "hyperparameters": keywords}
         super().restore(header, tensors, same)
         self.let_clone_compete()
+
+    def _check_same(self, header: Mapping[str, Any], names: tuple[str, ...]) -> None:
+        """Refuse other shapes. Heads that have learned need the bins that they learned with."""
+        learned = header["counters"].get("updates")
+        super()._check_same(header, (*names, "bin_range") if learned else names)
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """Load weights and optimisers in place; a posterior that was loaded is not adapted to data.

@@ -28,6 +28,10 @@ STYLES: dict[str, dict[str, Any]] = {
     "from scratch": {"color": "#56b4e9", "lw": 2.4},
 }
 COMMON = tuple(STYLES)[:6]  # compared on every robot
+CAPTION = (  # of the strips, in lines that fit above a single panel
+    "Upper row: what happened. Rows below: what is predicted from\n"
+    "the actions alone, after the last image seen. One step is one action."
+)
 
 
 class Curve(NamedTuple):
@@ -94,21 +98,31 @@ def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
 
 
 def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
-    """Draw a block per strip, with predictors as rows and horizons as columns."""
-    figure, panels = _grid(len(strips), (4.4, 2.75))
+    """Draw a block per strip, with predictors as rows and horizons as columns.
+
+    Horizon 0 is the last image that the predictors see.
+    """
+    figure, panels = _grid(len(strips), (4.4, 3.0))
     for axes, strip in zip(panels, strips, strict=False):
         axes.imshow(montage(list(strip.images.values())), interpolation="nearest")
         centres = [32 + 66 * i for i in range(max(len(strip.horizons), len(strip.images)))]
-        axes.set_xticks(centres[: len(strip.horizons)], [f"+{h}" for h in strip.horizons])
+        axes.set_xticks(centres[: len(strip.horizons)], [ahead(h) for h in strip.horizons])
         names = [name.replace(", then ", ",\nthen ") for name in strip.images]
         axes.set_yticks(centres[: len(names)], names)
         axes.tick_params(length=0, labelcolor=INK, labeltop=True, labelbottom=False)
+        axes.tick_params("x", labelsize=8)
         axes.set_title(strip.title)
         axes.spines[:].set_visible(False)
+    figure.suptitle(CAPTION, fontsize=8, color=INK)
     file = io.BytesIO()
     figure.savefig(file, dpi=110)
     Image.open(file).convert("RGB").quantize(256).save(path)  # reduces the file to a third
     plt.close(figure)
+
+
+def ahead(steps: int) -> str:
+    """Return the label of an image, in two lines: its number of steps after the last seen one."""
+    return f"{steps} step{'s' * (steps != 1)}\nahead" if steps else "last\nseen"
 
 
 def montage(rows: Sequence[np.ndarray], gap: int = 2) -> np.ndarray:

@@ -13,6 +13,7 @@ matplotlib.use("Agg")  # no display
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
+from wpt_agents.zoo.pictures.predictions import ahead
 from wpt_agents.zoo.result import NOTHING, PRIOR_ACTOR, RANDOM, Score, final_policy
 
 INK = "#1f2933"
@@ -90,18 +91,19 @@ def prediction_strip(
     dreamt = np.linspace(context, len(true) - 1, columns - len(seen)).round().astype(int)
     steps = [*seen, *dict.fromkeys(dreamt.tolist())]
     figure, axes = plt.subplots(
-        2, len(steps), figsize=(len(steps), 2.75), layout="constrained", squeeze=False
+        2, len(steps), figsize=(len(steps), 2.95), layout="constrained", squeeze=False
     )
     for column, step in enumerate(steps):
         for row, images in enumerate((true, predicted)):
             axes[row, column].imshow(images[step])
             axes[row, column].set(xticks=[], yticks=[])
             axes[row, column].spines[:].set_color(AGENT if step < context else INK)
-        label = f"step {step}\nseen" if step < context else f"+{step - context + 1}"
+        label = ahead(step - context + 1) if step else "first\nseen"
         axes[0, column].set_title(label, fontsize=9, color=INK)
     axes[0, 0].set_ylabel("true")
     axes[1, 0].set_ylabel("predicted")
-    figure.suptitle(title, fontsize=10)
+    explained = "above: what happened; below: what the world model predicts from the actions alone"
+    figure.suptitle(f"{title}\n{explained}; a step is one action", fontsize=10)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

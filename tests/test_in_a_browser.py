@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from run_folders import make_run
 
+from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.page import write_page
 
 ROOT = Path(__file__).parents[1]
@@ -68,6 +69,20 @@ while (walker.nextNode()) {
     found.add(`${ratio.toFixed(2)} ${style.color} ${e.className}: ${text.slice(0, 50)}`);
 }
 return [...found];
+"""
+
+# What has to be scrolled sideways to be read, with everything unfolded.
+SCROLLING = """
+document.querySelectorAll('details').forEach(details => details.open = true);
+return [...document.querySelectorAll('.scroll, .strip, pre')].filter(
+  e => e.scrollWidth > e.clientWidth + 1).map(e => e.textContent.trim().slice(0, 60));
+"""
+# By how many of 100 pixels a table scrolls, and how far its first cell is from its edge then.
+FIRST_COLUMN = """
+const box = document.querySelector('#table-5 .scroll');
+box.scrollLeft = 100;
+const left = e => e.getBoundingClientRect().left;
+return [box.scrollLeft, left(box.querySelector('td')) - left(box)];
 """
 
 pytestmark = [pytest.mark.nightly, pytest.mark.filterwarnings("ignore::ResourceWarning")]
@@ -145,6 +160,31 @@ FINE = {"errors": [], "overflowing": [], "pale": []}
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_report_can_be_read(browser, report, width, scheme):
     assert look(browser, report, "report", width, scheme) == FINE
+
+
+@pytest.fixture(scope="module")
+def wide_report(tmp_path_factory):
+    """A report on all methods, with three seeds and the budget, seeds and commit in every cell."""
+    runs = tmp_path_factory.mktemp("wide")
+    for task in ("dmc-walker-run", "metaworld-button-press-topdown-wall"):
+        for method in METHODS:
+            for seed in range(3):
+                make_run(runs, task, seed, method, (7.0, 760.0))
+    make_run(runs, "dmc-cheetah-run", preset="debug evaluate.during_episodes=2")
+    page = runs / "report" / "index.html"
+    write_page(runs, page)
+    return page
+
+
+def test_nothing_of_the_report_scrolls_sideways_in_a_wide_window(browser, wide_report):
+    look(browser, wide_report, "wide-report", 1440, "light")
+    assert browser.execute_script(SCROLLING) == []
+
+
+def test_the_first_column_of_the_report_stays_in_a_narrow_window(browser, wide_report):
+    look(browser, wide_report, "wide-report", 390, "light")
+    scrolled, distance = browser.execute_script(FIRST_COLUMN)
+    assert scrolled == 100 and 0 <= distance < 2
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

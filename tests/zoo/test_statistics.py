@@ -14,6 +14,7 @@ from wpt_agents.zoo.statistics import (
     optimality_gap,
     performance_profile,
     probability_of_improvement,
+    resamplable,
     resample,
     sign_test,
 )
@@ -131,15 +132,22 @@ def test_the_profile_and_its_band_are_rliables():
     assert high == pytest.approx([1, 0.6, 0], abs=0.01)
 
 
-@pytest.mark.parametrize("n", [2, 3, 10, 31, 50])
+@pytest.mark.parametrize("n", [3, 10, 31, 50])
 def test_the_interval_is_students(n):
     values = np.random.default_rng(n).normal(5, 2, n)
     expected = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
     assert mean_interval(values.tolist())[1:] == pytest.approx(expected, abs=2e-3)
 
 
-def test_one_value_has_no_interval():
+def test_fewer_than_three_values_have_no_interval():
     assert mean_interval([3.0]) == (3.0, None, None)
+    assert mean_interval([0.0, 1.0]) == (0.5, None, None)
+
+
+def test_a_bootstrap_needs_two_scores_of_each_stratum_and_two_degrees_of_freedom():
+    cases = {(2,): False, (3,): True, (2, 2): True, (9, 1): False, (1,): False}
+    for sizes, enough in cases.items():
+        assert resamplable([np.zeros(size) for size in sizes]) == enough, sizes
 
 
 def test_the_sign_test_by_hand_and_against_scipys():

@@ -69,8 +69,12 @@ def resample(scores: Scores, draws: int, rng: np.random.Generator) -> list[np.nd
 
 
 def resamplable(scores: Scores) -> bool:
-    """Return whether each stratum has several scores, which the bootstrap requires."""
-    return all(len(stratum) > 1 for stratum in scores)
+    """Return whether a bootstrap of the strata says something about the spread.
+
+    Every stratum needs several scores, and all together need two degrees of freedom, as three seeds
+    of one task or two seeds of two tasks have: that of two scores would end at these two scores.
+    """
+    return min(map(len, scores)) > 1 and sum(len(stratum) - 1 for stratum in scores) > 1
 
 
 def bootstrap(
@@ -88,9 +92,12 @@ def bootstrap(
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float | None]:
-    """Return the mean and its 95 % interval by Student's t; None for the interval of one value."""
+    """Return the mean and its 95 % interval by Student's t, which is None below three values.
+
+    That of two values is 13 times as wide as their difference, and says less than the two values.
+    """
     middle, n = float(np.mean(values)), len(values)
-    if n < 2:
+    if n < 3:
         return middle, None, None
     t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # accurate to 0.005
     half = t * float(np.std(values, ddof=1)) / n**0.5

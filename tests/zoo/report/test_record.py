@@ -165,7 +165,8 @@ def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
     fewer = record_tables.by_suite(
         [entry for entry in lines if (entry.task, entry.seed) != ("dmc-0", 1)]
     )
-    assert fewer["wpt"]["mw"][1].low == 80 and fewer["wpt"]["both"][1].low is None  # one of them
+    assert fewer["wpt"]["mw"][1].low is None  # two seeds of a single task
+    assert fewer["wpt"]["dmc"][1].low is None and fewer["wpt"]["both"][1].low is None  # one of one
     assert set(suites) == {"wpt", "scratch, 3x frames", "random"} and "both" not in suites["random"]
 
 
@@ -281,3 +282,8 @@ def test_a_method_of_two_budgets_is_drawn_with_both():
 def test_two_seeds_have_no_interval_by_students_t():
     assert str(record_tables.Cell.of([0.0, 85.0])) == "42.5"
     assert str(record_tables.Cell.of([40.0, 50.0, 60.0])) == "50.0 (25.2 to 74.8)"
+    # sd 11.5, 6.7 -+ 4.303 * 11.5 / sqrt(3) = 28.7; a success rate is not negative
+    scores = enumerate((0.0, 0.0, 20.0))
+    rates = [line("wpt", score, seed=seed, suite="metaworld") for seed, score in scores]
+    (cells,) = record_tables.by_task(rates).values()
+    assert [str(cell) for cell in cells.values()] == ["6.7 (0.00* to 35.4)"]

@@ -11,6 +11,7 @@ from run_folders import make_run
 
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.report.folders import read_results
+from wpt_agents.zoo.report.numbers import interval_text
 from wpt_agents.zoo.result import Result, Score, Variant, write_result
 
 
@@ -27,7 +28,7 @@ def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
         write_result(tmp_path / str(seed), fake_result(seed, mean))
     (row,) = tables.summarise(read_results(tmp_path))
     # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
-    assert (row.seeds, row.mean, row.paper) == (3, 710, 728.0)
+    assert (row.scores, row.mean, row.paper) == ((700, 710, 720), 710, 728.0)
     assert (row.low, row.high) == pytest.approx((685.2, 734.8), abs=0.1)
 
 
@@ -48,7 +49,36 @@ def test_the_report_prints_as_table_and_as_markdown(capsys):
     for text in (printed, tables.markdown(rows)):
         assert "1.23" in text
         assert "457" in text
-    assert tables.markdown(rows).count("\n") == 4
+    assert tables.markdown(rows).count("\n") == 6  # heading, line, two rows, and a note
+
+
+def success_results(*rates):
+    """Results on a task that counts successes, one for each success rate in ten episodes."""
+    where = "metaworld", "metaworld-reach", "wpt", Variant("tiny")
+    scores = [Score((0.0,) * 10, tuple(i < 10 * rate for i in range(10))) for rate in rates]
+    return [
+        Result(*where, seed, 10, 5, "success", {"last": score}) for seed, score in enumerate(scores)
+    ]
+
+
+def test_two_seeds_are_shown_as_they_are_and_one_has_no_interval(capsys):
+    both = success_results(1.0, 0.3)
+    for results, cell in ((both, "1.00 and 0.30"), (both[:1], "one seed")):
+        rows = tables.summarise(results)
+        Console(width=200).print(tables.summary_table(rows))
+        assert cell in capsys.readouterr().out and f"| {cell} |" in tables.markdown(rows)
+    (row,) = tables.policies([fake_result(0, 1.0), fake_result(1, 9.0)])
+    assert (row.seeds_low, row.t_low) == (None, None)
+    assert tables.policy_cells(row)[1:5] == ["5.0", "1.00, 9.0", "-5.0 to 15.0", "-"]
+
+
+def test_an_interval_that_reaches_beyond_a_success_rate_is_cut_off_and_marked():
+    # mean 0.9, sd 0.1: 0.9 -+ 4.303 * 0.1 / sqrt(3) = 0.652 to 1.148
+    three = tables.summarise(success_results(1.0, 0.9, 0.8))
+    assert "| 0.90 | 0.65 to 1.00* |" in tables.markdown(three)
+    returns = [fake_result(seed, mean) for seed, mean in enumerate((0.0, 5.0, 10.0))]
+    assert "| 5.0 | -7.4 to 17.4 |" in tables.markdown(tables.summarise(returns))
+    assert interval_text(-0.2, 1.0, (0.0, 1.0)) == "0.00* to 1.00"
 
 
 def test_every_policy_has_its_seeds_and_three_intervals():
@@ -74,9 +104,9 @@ def test_untrained_policies_are_told_once_however_many_methods_met_them():
     ]
     assert rows[0].seeds_low is None  # one seed
     table = tables.policy_markdown(rows)
-    assert "| doing nothing | 1.00 | 1.00 | -9.0 to 11.0 | - | - | - |" in table
+    assert "| doing nothing | 1.00 | 1.00 | - | - | - |" in table  # two episodes: no interval
     assert "| scratch | 5.0 |" in table
-    assert "Seeds 0, 2 episodes each; commit abc." in table
+    assert "Seed 0; 2 episodes per seed; commit abc." in table
 
 
 def test_seeds_and_commits_are_those_of_each_policy_where_they_differ():
@@ -84,8 +114,8 @@ def test_seeds_and_commits_are_those_of_each_policy_where_they_differ():
     results += [replace(fake_result(7, 5.0, "scratch"), commit="def")]
     note = tables.policy_note(tables.policies(results))
     assert note == (
-        "scratch: seeds 7, 2 episodes each; commit def. "
-        "wpt: seeds 0, 1, 2, 2 episodes each; commit abc."
+        "scratch: seed 7; 2 episodes per seed; commit def. "
+        "wpt: seeds 0, 1, 2; 2 episodes per seed; commit abc."
     )
 
 

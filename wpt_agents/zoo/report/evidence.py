@@ -10,9 +10,10 @@ from statistics import fmean
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.report.aggregates import STATISTICS, normalised, references
 from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.report.record import Line, place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
-from wpt_agents.zoo.report.tables import markdown_table, number
+from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Variant
 
 PAPER = {"dreamer-v3": "DreamerV3, paper", "drq-v2": "DrQ-v2, paper", "wpt": "WPT, paper"}

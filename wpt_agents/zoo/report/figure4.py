@@ -13,8 +13,9 @@ from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.report import figures
 from wpt_agents.zoo.report.folders import check_new
+from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.report.sections import curve
-from wpt_agents.zoo.report.tables import markdown_table, number
+from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
 
 COMPARED = ("wpt", "packnet")
@@ -92,14 +93,16 @@ def sequence_markdown(figures: Sequence[Figure4]) -> str:
                 for task, row in zip(tasks, matrix.rows, strict=False)  # unfinished: fewer rows
             ]
             table = markdown_table([matrix.name, *tasks], lines)
-            mean = f"Mean return on the task being learned: {number(matrix.mean)}."
+            seeds = counted(len(matrix.seeds), "seed")
+            mean = f"Means over {seeds}; on the tasks being learned: {number(matrix.mean)}."
             parts.append(f"### The sequence {figure.title}: {matrix.name}\n\n{table}\n{mean}\n")
     return "\n".join(parts)
 
 
 def sequence_table(figures: Sequence[Figure4]) -> Table:
     """Return the mean of each sequence and method as a table for a terminal."""
-    table = Table("sequence", "method", caption="mean over tasks of the return on the one learned")
+    caption = "mean over seeds and tasks of the return on the task that is being learned"
+    table = Table("sequence", "method", caption=caption)
     for heading in ("seeds", "tasks", "mean"):
         table.add_column(heading, justify="right")
     for figure in figures:

@@ -40,7 +40,7 @@ class Line:
     """One method's line with its band.
 
     :param x: (N,)
-    :param band: the middle and the ends of its 95 % interval, (N,) each; the middle itself for none
+    :param band: the middle and the ends of the shaded band, (N,) each; the middle itself for none
     """
 
     label: str

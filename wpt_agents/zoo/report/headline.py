@@ -36,7 +36,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Headline:
-    """WPT against other policies on a suite; `against` is empty if no task has several seeds."""
+    """WPT against other policies on a suite; `against` is empty if no task has three seeds."""
 
     suite: str
     preset: Variant
@@ -47,7 +47,7 @@ class Headline:
 def headlines(results: Sequence[Result]) -> list[Headline]:
     """Compare WPT with other policies, on each suite, preset and budget.
 
-    Tasks with a single seed have no interval and do not count.
+    Tasks with fewer than three seeds have no interval and do not count.
     """
     groups: dict[tuple[str, Variant, int], dict[str, Policies]] = {}
     for result in results:
@@ -66,7 +66,7 @@ def headlines(results: Sequence[Result]) -> list[Headline]:
 
 
 def compare(tasks: Sequence[Policies]) -> list[Comparison]:
-    """Compare WPT with each of COMPARED, on tasks with several seeds of both."""
+    """Compare WPT with each of COMPARED, on tasks with at least three seeds of both."""
     comparisons = []
     for title, name in COMPARED.items():
         pairs = [
@@ -74,7 +74,7 @@ def compare(tasks: Sequence[Policies]) -> list[Comparison]:
             for task in tasks
             if OURS in task and name in task
         ]
-        pairs = [pair for pair in pairs if min(map(len, pair)) > 1]
+        pairs = [pair for pair in pairs if min(map(len, pair)) > 2]
         if pairs:
             higher = sum(above(ours, theirs) for ours, theirs in pairs)
             lower = sum(above(theirs, ours) for ours, theirs in pairs)

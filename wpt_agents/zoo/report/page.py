@@ -16,13 +16,14 @@ from wpt_agents.zoo.report import (
     figure2,
     figure4,
     headline,
+    numbers,
     paper_tables,
     sections,
     steadiness,
     tables,
 )
 from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
-from wpt_agents.zoo.report.names import policy_name, policy_title
+from wpt_agents.zoo.report.names import MEANINGS, policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
 from wpt_agents.zoo.result import Result, Score, Variant
 
@@ -58,7 +59,7 @@ def render(
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     env.filters |= {
-        "number": tables.number,
+        "number": numbers.number,
         "share": "{:.2f}".format,
         "count": "{:,}".format,
         "counted": counted,
@@ -67,6 +68,7 @@ def render(
     runs = sorted(runs, key=_order)
     names = Names(run.experiment for run in runs)
     results = [run.result for run in runs]
+    methods = {result.method for result in results} | {result.method for _, result in sequences}
     return env.get_template("page.html.jinja").render(
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         suites=[
@@ -84,6 +86,9 @@ def render(
         steadiness_cells=steadiness.cells,
         steadiness_headings=steadiness.HEADINGS,
         steadiness_considered=steadiness.CONSIDERED,
+        policies_note=tables.POLICY_NOTE,
+        rule=numbers.RULE,
+        meanings={method: text for method, text in MEANINGS.items() if method in methods},
         runs=[card(run, names, media in illustrated(run, runs)) for run in runs],
         unfinished=unfinished,
         headline=headline.headlines(results),
@@ -97,7 +102,7 @@ def render(
 def interval_of(score: Score) -> str:
     """Format the 95 % interval of a score over its episodes."""
     _, low, high = score.interval
-    return "–" if low is None else tables.interval_text(low, high)
+    return "–" if low is None else numbers.interval_text(low, high)
 
 
 def _order(run: Finished) -> tuple[str, str, Variant, int, int, int]:

@@ -7,8 +7,9 @@ from statistics import fmean
 import numpy as np
 
 from wpt_agents.zoo.report.evidence import Evidence, evidence
+from wpt_agents.zoo.report.numbers import interval_text, number
 from wpt_agents.zoo.report.record import Line
-from wpt_agents.zoo.report.tables import interval_text, markdown_table, number
+from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.statistics import bootstrap, mean, sign_test
 
 PAPER_WPT = "the paper's WPT"
@@ -43,8 +44,8 @@ class Pair:
 
     @property
     def interval(self) -> tuple[float | None, float | None]:
-        """The 95 % bootstrap interval of the mean difference over tasks, None for a single task."""
-        if len(self.differences) < 2:
+        """The 95 % bootstrap interval of the mean difference over tasks, None below three tasks."""
+        if len(self.differences) < 3:
             return None, None
         low, high = bootstrap(mean, [np.array(self.differences)])
         return round(float(low), 6) + 0.0, round(float(high), 6) + 0.0  # no "-0.00"

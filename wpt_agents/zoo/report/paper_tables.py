@@ -9,16 +9,18 @@ import numpy as np
 from wpt_agents.zoo.report import aggregates
 from wpt_agents.zoo.report.aggregates import STATISTICS, Reference
 from wpt_agents.zoo.report.folders import Finished
+from wpt_agents.zoo.report.headline import PAPER_BUDGET
+from wpt_agents.zoo.report.numbers import POSSIBLE, evidence_text, seeds_text
 from wpt_agents.zoo.report.sections import BASELINES, Names
-from wpt_agents.zoo.report.tables import interval_text
 from wpt_agents.zoo.statistics import mean_interval
 
 OFFICIAL = {  # published by the authors of these methods, on eight tasks of Table 5
-    "dreamer-v3-official": "Dreamer v3, its authors",
-    "drq-v2-official": "DrQ v2, its authors",
-    "mrq-official": "MR.Q, its authors",
+    "dreamer-v3-official": "DreamerV3, by its authors",
+    "drq-v2-official": "DrQ-v2, by its authors",
+    "mrq-official": "MR.Q, by its authors",
 }
 COLUMNS = BASELINES | OFFICIAL
+OURS_PER_TABLE = 6  # of our columns; with the paper's they fit into a window of 1,440 pixels
 TITLES = {3: "Meta-World", 4: "Meta-World, continued", 5: "DMControl"}
 
 
@@ -28,7 +30,7 @@ class Cell:
 
     :param run: the name of the first run, None for an aggregate over tasks
     :param tasks: the number of tasks of an aggregate
-    :param interval: the 95 % interval over seeds, by Student's t
+    :param interval: the 95 % interval over seeds by Student's t, or what takes its place
     :param note: budget, seeds and commits; "" if they are in the column's heading
     """
 
@@ -55,9 +57,13 @@ class TableRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One of the tables; tasks without runs are separate.
+    """One of the tables; tasks without runs are separate, and so are columns that few look for.
 
     :param ours: our columns' names, each with the note that all of its cells share
+    :param groups: the places of our columns in each of the tables that they are divided among
+    :param near: the places of the paper's columns at its own budget, which are beside ours
+    :param far: the places of the other columns
+    :param evidence: from how many seeds and episodes our scores are
     """
 
     number: int
@@ -65,10 +71,14 @@ class PaperTable:
     metric: str
     columns: Sequence[str]
     ours: Mapping[str, str]
+    groups: Sequence[Sequence[int]]
+    near: Sequence[int]
+    far: Sequence[int]
     rows: Sequence[TableRow]
     not_run: Sequence[TableRow]
     source: str
     misprints: bool
+    evidence: str
 
 
 Cells = Mapping[tuple[str, str], Sequence[Finished]]  # runs by task and column
@@ -99,16 +109,24 @@ def paper_table(
     rows = {task: table_row(task, printed, columns, ours, cells) for task in tasks}
     run_rows = [row for task, row in rows.items() if task in shown]
     notes = [shared_note(run_rows, place) for place in range(len(ours))]
+    near = [i for i, (method, n) in enumerate(columns) if n == PAPER_BUDGET and method in BASELINES]
     return PaperTable(
         number=number,
         title=TITLES[number],
         metric="success rate" if printed[0].suite == "metaworld" else "return",
-        columns=[f"{COLUMNS[method]} @ {samples_text(n)}" for method, n in columns],
+        columns=[f"{COLUMNS[method]}, {samples_text(n)} frames" for method, n in columns],
         ours=dict(zip(ours, notes, strict=True)),
+        groups=[
+            range(start, min(start + OURS_PER_TABLE, len(ours)))
+            for start in range(0, len(ours), OURS_PER_TABLE)
+        ],
+        near=near,
+        far=[place for place in range(len(columns)) if place not in near],
         rows=[without_notes(row, notes) for row in run_rows],
         not_run=[row for task, row in rows.items() if task not in shown],
         source="; ".join(dict.fromkeys(row.source for row in printed)),
         misprints=any(aggregates.misprint(row) is not None for row in printed),
+        evidence=evidence_text([run.result for run in runs]),
     )
 
 
@@ -173,15 +191,13 @@ def our_cell(runs: Sequence[Finished]) -> Cell | None:
     if not runs:
         return None
     first = runs[0].result
-    middle, low, high = mean_interval([run.result.counted() for run in runs])
-    if first.metric == "success" and low is not None and high is not None:
-        low = max(low, 0.0)
-        high = min(high, 1.0)
+    scores = [run.result.counted() for run in runs]
+    middle, low, high = mean_interval(scores)
     seeds = ", ".join(str(run.result.seed) for run in runs)
     commits = ", ".join(sorted({run.result.commit_name for run in runs}))
     return Cell(
         mean=middle,
         run=runs[0].name,
-        interval="one seed: no interval" if low is None else interval_text(low, high),
+        interval=seeds_text(scores, low, high, POSSIBLE[first.metric]),
         note=f"{first.frames:,} frames, seeds {seeds}, commit {commits}",
     )

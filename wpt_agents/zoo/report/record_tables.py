@@ -8,35 +8,38 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from wpt_agents.zoo.report.numbers import ANY, PERCENT, Range, interval_text, number
 from wpt_agents.zoo.report.record import Line, place
-from wpt_agents.zoo.report.tables import interval_text, markdown_table, number
+from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Variant
-from wpt_agents.zoo.statistics import Scores, bootstrap, mean, mean_interval
+from wpt_agents.zoo.statistics import Scores, bootstrap, mean, mean_interval, resamplable
 
 OURS = ("wpt+", "wpt")  # the main methods of a record
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The scores of one method on one task or benchmark, with a 95 % interval."""
+    """The scores of one method on one task or benchmark, with a 95 % interval.
+
+    :param possible: the range of the scores
+    """
 
     scores: tuple[float, ...]
     mean: float
     low: float | None
     high: float | None
+    possible: Range = ANY
 
     @classmethod
-    def of(cls, scores: Sequence[float]) -> Self:
-        """Return the mean over seeds, with Student's t interval from three seeds on.
-
-        That of two is 13 times as wide as their difference, and tells less than the two scores.
-        """
-        middle, low, high = mean_interval(scores)
-        return cls(tuple(scores), middle, *((low, high) if len(scores) > 2 else (None, None)))
+    def of(cls, scores: Sequence[float], possible: Range = ANY) -> Self:
+        """Return the mean over seeds, with Student's t interval from three seeds on."""
+        return cls(tuple(scores), *mean_interval(scores), possible)
 
     def __str__(self) -> str:
-        interval = f" ({interval_text(self.low, self.high)})" if self.low is not None else ""
-        return number(self.mean) + interval
+        if self.low is None:
+            return number(self.mean)
+        interval = interval_text(self.low, self.high, self.possible)
+        return f"{number(self.mean)} ({interval})"
 
 
 class Key(NamedTuple):
@@ -53,8 +56,11 @@ def by_task(lines: Iterable[Line]) -> dict[tuple[str, str], dict[Key, Cell]]:
     for line in lines:
         scores[line.suite, line.task][Key(line.method, line.preset, line.frames)].append(line.score)
     return {
-        task: {key: Cell.of(values) for key, values in methods.items()}
-        for task, methods in scores.items()
+        (suite, task): {
+            key: Cell.of(values, ANY if suite == "dmc" else PERCENT)
+            for key, values in methods.items()
+        }
+        for (suite, task), methods in scores.items()
     }
 
 
@@ -119,17 +125,25 @@ def _means(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, Mea
 def _cell(strata: Sequence[np.ndarray], statistic: Callable[[Scores], np.ndarray]) -> Cell:
     low = None
     high = None
-    if all(len(stratum) > 1 for stratum in strata):  # one seed has no spread
+    if resamplable(strata):
         low, high = map(float, bootstrap(statistic, strata))
     scores = tuple(float(s) for stratum in strata for s in stratum)
     return Cell(scores, float(statistic(strata)), low, high)
 
 
 TASK_HEADINGS = (
-    *("task", "method", "preset", "frames", "score (95 % by t, of 3 seeds on)", "of each seed"),
+    *("task", "method", "preset", "frames", "score (95 % over seeds)", "of each seed"),
     "mean return",
 )
 SUITE_HEADINGS = ("suite", "method", "tasks", "runs", "mean score (95 %, bootstrap)")
+TASK_NOTE = (
+    "Scores are from 0 to 100. In brackets is the 95 % interval over seeds by Student's t, from "
+    "three seeds on; an end marked * is cut off at the limit of a success rate."
+)
+SUITE_NOTE = (
+    "In brackets is the 95 % interval by a bootstrap of the seeds within each task, of which every "
+    "task needs two and a single task three."
+)
 
 
 def markdown(lines: Sequence[Line]) -> str:
@@ -150,6 +164,6 @@ def markdown(lines: Sequence[Line]) -> str:
         for suite, (tasks, cell) in means.items()
     ]
     return (
-        f"## Every run\n\n{markdown_table(TASK_HEADINGS, rows)}\n"
-        f"## Means over tasks\n\n{markdown_table(SUITE_HEADINGS, suites)}"
+        f"## Every run\n\n{TASK_NOTE}\n\n{markdown_table(TASK_HEADINGS, rows)}\n"
+        f"## Means over tasks\n\n{SUITE_NOTE}\n\n{markdown_table(SUITE_HEADINGS, suites)}"
     )

@@ -12,12 +12,13 @@ from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import Aggregate, Estimate, Experiment
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.headline import OURS, PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.numbers import evidence_text, span
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
 BASELINES = {  # of the paper's tables
-    "dreamer-v3": "Dreamer v3",
-    "drq-v2": "DrQ v2",
+    "dreamer-v3": "DreamerV3",
+    "drq-v2": "DrQ-v2",
     "wpt": "WPT",
     "ncrl": "WPT (ICLR 2026)",
 }
@@ -81,6 +82,8 @@ class Section:
     :param all_names: of all experiments of the page, for the colours
     :param tasks: the number of the suite's tasks in the paper
     :param ablation_missing: the methods of Fig. 5 without runs
+    :param evidence: from how many seeds and episodes the scores are
+    :param episodes: the number of episodes in each evaluation of the learning curves
     """
 
     name: str
@@ -93,16 +96,16 @@ class Section:
     profile: str
     ablation: str
     ablation_missing: Sequence[str]
+    evidence: str
     curves: Sequence[str]
+    episodes: str
 
 
 def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
     """Return the section about one suite."""
-    experiments = {
-        one: tasks
-        for one, tasks in aggregates.by_experiment(run.result for run in runs).items()
-        if one.suite == suite
-    }
+    of_suite = [run for run in runs if run.result.suite == suite]
+    results = [run.result for run in of_suite]
+    experiments = aggregates.by_experiment(results)
     return Section(
         name=SUITES[suite],
         names=list(dict.fromkeys(map(names, experiments))),
@@ -114,7 +117,9 @@ def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
         profile=profile(suite, experiments, names),
         ablation=ablation(suite, experiments, names),
         ablation_missing=[m for m in ABLATION if m not in {one.method for one in experiments}],
-        curves=curves(suite, runs, names),
+        evidence=evidence_text(results),
+        curves=curves(of_suite, names),
+        episodes=episodes_text(of_suite),
     )
 
 
@@ -206,11 +211,17 @@ def draw_ablation(
     return figures.bars(title, f"normalised mean, tasks: {len(common)}", values, colours)
 
 
-def curves(suite: str, runs: Sequence[Finished], names: Names) -> list[str]:
-    """Draw a figure for each task: evaluations over frames, their mean and interval over seeds."""
-    tasks = dict.fromkeys(run.result.task for run in runs if run.result.suite == suite)
-    drawn = [task_curves(task, runs, names) for task in tasks]
+def curves(runs: Sequence[Finished], names: Names) -> list[str]:
+    """Draw a figure for each task: evaluations over frames, their mean and range over seeds."""
+    drawn = [task_curves(task, runs, names) for task in dict.fromkeys(r.result.task for r in runs)]
     return [figure for figure in drawn if figure is not None]
+
+
+def episodes_text(runs: Sequence[Finished]) -> str:
+    """Return the number of episodes in each evaluation during fine-tuning, "" without any."""
+    evaluations = [run.evaluations() for run in runs]
+    numbers = {scores.shape[1] for _, scores in filter(None, evaluations)}
+    return span(numbers, "episode") if numbers else ""
 
 
 def task_curves(task: str, runs: Sequence[Finished], names: Names) -> str | None:
@@ -229,15 +240,10 @@ def task_curves(task: str, runs: Sequence[Finished], names: Names) -> str | None
 
 
 def curve(label: str, seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> figures.Line:
-    """Return the mean over seeds at the frames that all have reached, and its 95 % interval.
+    """Return the mean over seeds at the frames that all have reached, lowest and highest seed.
 
-    The interval resamples the seeds' means; with one seed, its episodes.
+    :param seeds: of each seed the frames (N,) and the scores (N, episodes)
     """
     reached = min(len(frames) for frames, _ in seeds)
-    bands = []
-    for at in range(reached):
-        scores = [episodes[at] for _, episodes in seeds]
-        strata = [np.array([s.mean() for s in scores])] if len(scores) > 1 else scores
-        bands.append((mean(strata), *bootstrap(mean, strata, draws=2000)))
-    middle, low, high = np.array(bands).reshape(-1, 3).T
-    return figures.Line(label, seeds[0][0][:reached], (middle, low, high))
+    means = np.array([scores[:reached].mean(1) for _, scores in seeds])
+    return figures.Line(label, seeds[0][0][:reached], (means.mean(0), means.min(0), means.max(0)))

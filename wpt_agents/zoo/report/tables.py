@@ -14,15 +14,18 @@ from rich.table import Table
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.report.aggregates import estimate, references
 from wpt_agents.zoo.report.names import policy_name, policy_title
+from wpt_agents.zoo.report.numbers import POSSIBLE, RULE, Range, interval_text, number, seeds_text
 from wpt_agents.zoo.result import POLICIES, UNTRAINED, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
 
 
 @dataclass(frozen=True)
 class Row:
-    """One task and method over its seeds, each averaged over episodes.
+    """One task and method over its seeds.
 
-    :param low: lower end of the 95 % interval over seeds (Student's t), None with one seed
+    :param scores: of each seed, the mean return of its episodes or their success rate
+    :param low: lower end of the 95 % interval over seeds (Student's t), None below three seeds
+    :param possible: the range of the scores
     :param paper: the paper's score of this method at 150,000 frames, if there is one
     """
 
@@ -30,24 +33,26 @@ class Row:
     method: str
     preset: Variant
     frames: int
-    seeds: int
+    scores: tuple[float, ...]
     mean: float
     low: float | None
     high: float | None
+    possible: Range
     paper: float | None
 
 
 def summarise(results: Iterable[Result]) -> list[Row]:
     """Return one row for each task, method, variant and budget."""
-    groups: dict[tuple[str, str, Variant, int], list[float]] = defaultdict(list)
-    for result in results:
-        group = result.task, result.method, result.variant, result.frames
-        groups[group].append(result.counted())
+    groups: dict[tuple[str, str, Variant, int], list[Result]] = defaultdict(list)
+    for result in sorted(results, key=lambda result: result.seed):
+        groups[result.identity[:-1]].append(result)
     paper = paper_scores()
-    return [
-        Row(*group, len(scores), *mean_interval(scores), paper.get(group[:2]))
-        for group, scores in sorted(groups.items())
-    ]
+    rows = []
+    for group, runs in sorted(groups.items(), key=lambda item: item[0]):
+        scores = tuple(run.counted() for run in runs)
+        possible = POSSIBLE[runs[0].metric]
+        rows.append(Row(*group, scores, *mean_interval(scores), possible, paper.get(group[:2])))
+    return rows
 
 
 @dataclass(frozen=True)
@@ -60,9 +65,9 @@ class PolicyRow:
     :param final: whether it is the final policy of its runs
     :param means: the mean of each seed over its `episodes` episodes
     :param episodes_low: by a bootstrap of the episodes within each seed, as if these seeds were
-        played again; None with one episode
-    :param seeds_low: by a bootstrap of the seeds' means, as if other seeds were trained; None with
-        one seed
+        played again; None for two or fewer episodes of one seed
+    :param seeds_low: by a bootstrap of the seeds' means, as if other seeds were trained; None for
+        two or fewer seeds
     :param t_low: the same by Student's t, which is wider for few seeds
     :param success: the share of successful episodes, None if the task reports none
     """
@@ -149,23 +154,13 @@ def paper_scores() -> dict[tuple[str, str], float]:
     }
 
 
-def interval_text(low: float | None, high: float | None) -> str:
-    """Format a 95 % interval for a table's cell."""
-    return "-" if low is None or high is None else f"{number(low)} to {number(high)}"
-
-
-def number(value: float | None) -> str:
-    """Format a score with its significant digits: 0.42, 7.3, 512."""
-    if value is None:
-        return "-"
-    digits = 2 if abs(value) < 2 else 1 if abs(value) < 100 else 0
-    return f"{value:.{digits}f}"
-
-
 def scores_table(result: Result) -> Table:
     """Return a table of the policies of one run."""
     episodes = counted(len(result.final.returns), "episode")
-    caption = f"{episodes} each, after {result.frames:,} frames of fine-tuning"
+    caption = (
+        f"{episodes} each, after {result.frames:,} frames of fine-tuning; "
+        "intervals over episodes by Student's t"
+    )
     title = f"{result.task}, {result.method}, seed {result.seed}"
     table = Table(title=title, caption=caption)
     table.add_column("policy")
@@ -185,29 +180,38 @@ def scores_table(result: Result) -> Table:
     return table
 
 
-HEADINGS = ("task", "method", "preset", "frames", "seeds", "mean", "95 % interval", "paper at 150k")
+HEADINGS = (
+    *("task", "method", "preset", "frames", "seeds", "mean"),
+    *("95 % interval or both seeds", "paper at 150k"),
+)
+NOTE = (
+    "A mean is over the mean returns of the seeds' evaluation episodes or, on tasks that count "
+    f"successes, over their success rates. {RULE}"
+)
 
 
 def cells(row: Row) -> list[str]:
     """Write a row as text, in the order of HEADINGS."""
-    names = [row.task, row.method, str(row.preset), f"{row.frames:,}", str(row.seeds)]
-    return [*names, number(row.mean), interval_text(row.low, row.high), number(row.paper)]
+    names = [row.task, row.method, str(row.preset), f"{row.frames:,}", str(len(row.scores))]
+    spread = seeds_text(row.scores, row.low, row.high, row.possible)
+    return [*names, number(row.mean), spread, number(row.paper)]
 
 
 def summary_table(rows: Sequence[Row]) -> Table:
     """Return the rows as a table for a terminal."""
-    table = Table(caption="mean over seeds; interval over seeds by Student's t")
+    table = Table(caption=NOTE)
     for heading in HEADINGS:
         words = heading in ("task", "method", "preset")
-        table.add_column(heading, justify="left" if words else "right")
+        title = heading.replace(" or", "\nor")
+        table.add_column(title, justify="left" if words else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(escape, cells(row)))  # a preset's name may contain brackets
     return table
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Return the rows as a Markdown table."""
-    return markdown_table(HEADINGS, map(cells, rows))
+    """Return the rows as a Markdown table with its explanation."""
+    return f"{markdown_table(HEADINGS, map(cells, rows))}\n{NOTE}\n"
 
 
 def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
@@ -217,8 +221,14 @@ def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> s
 
 
 POLICY_HEADINGS = (
-    *("policy", "mean return of each seed", "mean"),
-    *("95 %, episodes", "95 %, seeds", "95 %, seeds by t", "success at the last step"),
+    *("policy", "mean return", "mean return of each seed"),
+    *("95 % over episodes", "95 % over seeds", "success rate"),
+)
+POLICY_NOTE = (
+    "The first 95 % interval is a bootstrap of each seed's episodes: how much other episodes of "
+    "these seeds would change the mean. The second is over the seeds by Student's t, from three "
+    "seeds on: how much other seeds would change it. A success counts if it lasts until the last "
+    "step of the episode."
 )
 
 
@@ -226,10 +236,9 @@ def policy_cells(row: PolicyRow) -> list[str]:
     """Write a row as text, in the order of POLICY_HEADINGS."""
     return [
         policy_title(row.name),
-        ", ".join(map(number, row.means)),
         number(row.mean),
+        ", ".join(map(number, row.means)),
         interval_text(row.episodes_low, row.episodes_high),
-        interval_text(row.seeds_low, row.seeds_high),
         interval_text(row.t_low, row.t_high),
         "-" if row.success is None else f"{row.success:.2f}",
     ]
@@ -244,12 +253,12 @@ def by_task(rows: Iterable[PolicyRow]) -> Mapping[str, Sequence[PolicyRow]]:
 
 
 def policy_markdown(rows: Sequence[PolicyRow]) -> str:
-    """Return a Markdown table for each task, with seeds and commits under it."""
+    """Return a Markdown table for each task, with seeds and commits under it, and a note."""
     parts = []
     for title, table in by_task(rows).items():
         lines = markdown_table(POLICY_HEADINGS, map(policy_cells, table))
         parts.append(f"### {title}\n\n{lines}\n{policy_note(table)}\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, f"{POLICY_NOTE}\n"])
 
 
 def policy_note(rows: Sequence[PolicyRow]) -> str:
@@ -258,7 +267,9 @@ def policy_note(rows: Sequence[PolicyRow]) -> str:
     for row in rows:
         seeds = ", ".join(map(str, row.seeds))
         commits = ", ".join(row.commits)
-        note = f"seeds {seeds}, {counted(row.episodes, 'episode')} each; commit {commits}."
+        noun = "seed" if len(row.seeds) == 1 else "seeds"
+        episodes = counted(row.episodes, "episode")
+        note = f"{noun} {seeds}; {episodes} per seed; commit {commits}."
         notes[note].append(policy_title(row.name))
     if len(notes) == 1:
         return next(iter(notes)).replace("s", "S", 1)

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from wpt_agents.zoo.learning_curves import MONITOR, TrainingEpisodes
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.report.tables import number
+from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 

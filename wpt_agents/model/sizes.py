@@ -86,7 +86,7 @@ class Size:
 #: The sizes by name. Table 2 prints 12288 as hidden and 1536 as deterministic for `paper`. Only the
 #: other way round does the world model have the 280 M parameters of the text, as a test counts
 #: (tests/model/test_world_model.py). The others are ours: small enough for a CPU, with rates that
-#: grow as widths shrink, and with the budgets of the presets in zoo/*.yaml, rounded.
+#: grow as widths shrink, and with the budgets of the presets in the folder `zoo`, rounded.
 #:
 #: :meta hide-value:
 SIZES = {

@@ -158,8 +158,11 @@ class StoredTrajectories:
             yield np.stack(list(self._threads.map(self._first_image, chunk)))
 
     def images(self, i: int, times: Sequence[int]) -> np.ndarray:
-        """Return images of trajectory `i`, (len(times), S, S, 3) uint8; only their blocks are read.
+        """Return images of a trajectory; only their blocks are read.
 
+        :param i: the number of the trajectory
+        :param times: n numbers of images, from 0 to T
+        :return: (n, S, S, 3) uint8
         :raises ValueError: the trajectory is damaged
         """
         parts = [self._read((i, time, time + 1)) for time in times]

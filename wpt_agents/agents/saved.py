@@ -273,7 +273,7 @@ class SavedAgent(KeywordAgent):
 
         :param same: keywords that must be equal here and in the file
         """
-        self._check_same(header, same)
+        self._check_same(header, tensors, same)
         progress = self.progress_class.of(header["counters"])
         self._load_tensors(tensors)
         self.progress = progress
@@ -288,7 +288,12 @@ class SavedAgent(KeywordAgent):
         :param weights: by name; none of a file that holds a world model alone
         """
 
-    def _check_same(self, header: Mapping[str, Any], names: tuple[str, ...]) -> None:
+    def _check_same(
+        self,
+        header: Mapping[str, Any],
+        tensors: Mapping[str, Mapping[str, Tensor]],
+        names: tuple[str, ...],
+    ) -> None:
         # of a `Size` it fills new fields
         trained_with = self.keywords.of(header["hyperparameters"])
         model_files.check_same(trained_with.as_dict(), self.hyperparameters.as_dict(), names)
@@ -312,7 +317,7 @@ class SavedAgent(KeywordAgent):
             super().set_parameters(deepcopy(load_path_or_dict), exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
-        self._check_same(header, self.shape_keywords)
+        self._check_same(header, tensors, self.shape_keywords)
         self._load_tensors(tensors)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -147,10 +147,15 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         super().restore(header, tensors, same)
         self.let_clone_compete()
 
-    def _check_same(self, header: Mapping[str, Any], names: tuple[str, ...]) -> None:
+    def _check_same(
+        self,
+        header: Mapping[str, Any],
+        tensors: Mapping[str, Mapping[str, Tensor]],
+        names: tuple[str, ...],
+    ) -> None:
         """Refuse other shapes. Heads that have learned need the bins that they learned with."""
-        learned = header["counters"].get("updates")
-        super()._check_same(header, (*names, "bin_range") if learned else names)
+        learned = WORLD_MODEL not in tensors and header["counters"].get("updates")
+        super()._check_same(header, tensors, (*names, "bin_range") if learned else names)
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """Load weights and optimisers in place; a posterior that was loaded is not adapted to data.

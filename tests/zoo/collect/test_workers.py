@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from wpt_agents.zoo.collect import workers
+
 PARENT = """
 import os
 import sys
@@ -90,6 +92,17 @@ if __name__ == "__main__":
         except KeyboardInterrupt:
             print("interrupted")
 """
+
+
+@pytest.mark.parametrize("ignored", [True, False])
+def test_workers_ignore_ctrl_c_if_their_parent_does(ignored, monkeypatch):
+    monkeypatch.setattr(workers, "end_with_parent", lambda: None)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+    try:
+        workers._begin()
+        assert signal.getsignal(signal.SIGINT) is (signal.SIG_IGN if ignored else signal.SIG_DFL)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ def worker_pool(workers: int) -> ProcessPoolExecutor:
 def _begin() -> None:
     end_with_parent()
     # A terminal sends Ctrl-C to all processes. The parent reports it; a worker ends without a word.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in background jobs of a script
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def end_with_parent() -> None:

@@ -52,6 +52,11 @@ def test_the_report_prints_as_table_and_as_markdown(capsys):
     assert tables.markdown(rows).count("\n") == 6  # heading, line, two rows, and a note
 
 
+def test_a_bar_in_a_name_does_not_end_its_cell():
+    (row,) = tables.summarise([replace(fake_result(0, 1.0), variant=Variant("tiny", data="a|b"))])
+    assert r"| tiny 'data=a\|b' |" in tables.markdown([row])
+
+
 def success_results(*rates):
     """Results on a task that counts successes, one for each success rate in ten episodes."""
     where = "metaworld", "metaworld-reach", "wpt", Variant("tiny")

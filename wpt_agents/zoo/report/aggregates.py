@@ -117,7 +117,7 @@ def aggregate(tasks: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
 
 
 def estimate(statistic: Any, *groups: Sequence[np.ndarray]) -> Estimate:
-    """Return a statistic and its 95 % interval, which is None if some task has only one run."""
+    """Return a statistic and its 95 % interval, which is None if the runs are not `resamplable`."""
     value = float(statistic(*groups))
     if not all(map(resamplable, groups)):
         return value, None, None

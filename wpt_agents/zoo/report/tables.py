@@ -217,7 +217,8 @@ def markdown(rows: Sequence[Row]) -> str:
 def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     every = [headings, ["---"] * len(headings), *lines]
-    return "".join(f"| {' | '.join(line)} |\n" for line in every)
+    escaped = ([cell.replace("|", "\\|") for cell in line] for line in every)
+    return "".join(f"| {' | '.join(line)} |\n" for line in escaped)
 
 
 POLICY_HEADINGS = (

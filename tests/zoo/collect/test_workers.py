@@ -74,6 +74,7 @@ def alive(pid):
 
 
 POOL = """
+import signal
 import sys
 import time
 
@@ -85,6 +86,7 @@ def begin(path):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background jobs
     with worker_pool(1) as pool:
         pool.submit(begin, sys.argv[1]).result()
         try:
@@ -111,8 +113,12 @@ def test_ctrl_c_ends_workers_without_a_traceback(tmp_path):
     script.write_text(POOL)
     command = [sys.executable, str(script), str(begun)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    parent = subprocess.Popen(command, start_new_session=True, **pipes)
-    until(begun.exists)
-    time.sleep(0.5)  # the worker waits for more work
-    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
-    assert parent.communicate(timeout=300) == ("interrupted\n", "")
+    with subprocess.Popen(command, start_new_session=True, **pipes) as parent:
+        until(begun.exists)
+        time.sleep(0.5)  # the worker waits for more work
+        os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+        try:
+            assert parent.communicate(timeout=60) == ("interrupted\n", "")
+        finally:
+            if parent.poll() is None:
+                os.killpg(parent.pid, signal.SIGKILL)

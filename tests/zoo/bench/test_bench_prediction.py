@@ -230,3 +230,15 @@ def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
 
 
 ROBOTS = ("walker", "cartpole")
+
+
+def test_probes_of_one_robot_leave_the_others_out(monkeypatch, tmp_path):
+    monkeypatch.setattr(bench, "QUICK", bench.QUICK._replace(folder=tmp_path))
+    probed = list(bench.rows(quick=True, probe=True, robots=["cartpole"]))
+    assert {row["model"] for row in probed} == {"untrained", "generalist", "specialist"}
+    assert {row["quantity"] for row in probed} == {"cart", "pole cos", "pole sin"}
+    assert not (tmp_path / "specialist-walker").exists()
+    with pytest.raises(ValueError, match="no robot dog: choose from walker, cartpole"):
+        next(bench.rows(quick=True, probe=True, robots=["dog"]))
+    with pytest.raises(ValueError, match="no effect without --probe"):
+        next(bench.rows(quick=True, robots=["cartpole"]))

@@ -79,6 +79,7 @@ def rows(
     updates: int | None = None,
     probe: bool = False,
     settings: Sequence[str] = (),
+    robots: Sequence[str] = (),
 ) -> Iterator[dict[str, Any]]:
     """Yield a row for each robot and way of predicting; draw `prediction.png` and `strips.png`.
 
@@ -86,17 +87,27 @@ def rows(
     :param probe: yield instead how well linear probes read the true state from the latents of the
         generalist and of each robot's specialist
     :param settings: keywords of WPT for the world models, as "key=value"
+    :param robots: probe only these; the generalist is trained on all robots nevertheless
+    :raises ValueError: if `robots` are given without `probe`, or if the data have none of them
     """
+    if robots and not probe:
+        raise ValueError("--robot has no effect without --probe: leave it out, or pass both")
     plan = QUICK if quick else FULL
     if updates is not None:
         plan = plan._replace(updates=updates, further=min(plan.further, updates))
+    known = [wpt_envs.TASKS[task].embodiment for task in plan.tasks]
+    if unknown := sorted(set(robots) - set(known)):
+        raise ValueError(
+            f"The data have no robot {', '.join(unknown)}: choose from "
+            f"{', '.join(dict.fromkeys(known))}"
+        )
     torch.set_num_threads(1)
     stored = plan.folder / "data"  # of all settings
     plan = changed(plan, settings)
     data = collect(stored, plan.tasks, plan.episodes, workers=1, behaviour=plan.behaviour, env=LOOK)
     dataset, held_out = split(data, plan)
     if probe:
-        yield from probes_of(plan, dataset)
+        yield from probes_of(plan, dataset, robots)
         return
     ways = predictors(plan, dataset)
     tests = {
@@ -119,12 +130,16 @@ def changed(plan: Plan, settings: Sequence[str]) -> Plan:
     return plan._replace(folder=folder, model={**plan.model, **changes})
 
 
-def probes_of(plan: Plan, dataset: TrajectoryDataset) -> Iterator[dict[str, Any]]:
+def probes_of(
+    plan: Plan, dataset: TrajectoryDataset, robots: Sequence[str] = ()
+) -> Iterator[dict[str, Any]]:
     """Yield the probes of an untrained model, the generalist and the robot's specialist."""
     untrained = WPT("WPTPolicy", seed=0, **plan.model)
     generalist = train(plan, "generalist", dataset, plan.updates)
     for task in plan.tasks:
         robot = wpt_envs.TASKS[task].embodiment
+        if robots and robot not in robots:
+            continue
         specialist = train(plan, f"specialist-{robot}", of(dataset, robot), plan.updates)
         models = {"untrained": untrained, "generalist": generalist, "specialist": specialist}
         for name, model in models.items():

@@ -87,6 +87,14 @@ Probe = Annotated[
         "latents.",
     ),
 ]
+Robots = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--robot",
+        help="For prediction with --probe: probe this robot only, such as `cartpole`; can be "
+        "repeated.",
+    ),
+]
 
 
 def bench(
@@ -102,6 +110,7 @@ def bench(
     behaviour: Behaviour = None,
     steps: Steps = None,
     probe: Probe = False,
+    robots: Robots = None,
     settings: Settings = None,
 ) -> None:
     """Measure speed, data formats, retrieval, prediction or exploration on this machine.
@@ -130,6 +139,7 @@ def bench(
         "updates": updates,
         "behaviours": behaviour,
         "steps": steps,
+        "robots": robots,
         "settings": settings,
     }
     everywhere = [c for c in Case if c not in (Case.all, Case.gpu)]  # the case gpu needs one
@@ -158,6 +168,7 @@ PARTIAL = {
     "updates": ("--updates", None),
     "behaviours": ("--behaviour", None),
     "steps": ("--steps", None),
+    "robots": ("--robot", None),
     "settings": ("--set", None),
 }
 

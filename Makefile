@@ -62,9 +62,13 @@ demo: rendering
 	@echo "[demo] collect, retrieve, clone, fine-tune, evaluate: python -m wpt_agents.zoo run $(DEMO_ARGS)"
 	@$(BIN)/python -m wpt_agents.zoo run --suite metaworld --tasks drawer-close --preset demo $(DEMO_ARGS)
 
+# A worker for each core, eight at most; the processes that tests start must not take more than theirs.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+WORKERS := -n auto --maxprocesses 8 --dist worksteal
+
 test: rendering
-	@echo "[test] pytest -m 'not nightly' $(TEST_ARGS)"
-	@$(BIN)/python -m pytest -m "not nightly" $(TEST_ARGS)
+	@echo "[test] pytest -m 'not nightly' $(WORKERS) $(TEST_ARGS)"
+	@$(PYTEST) $(WORKERS) -m "not nightly" $(TEST_ARGS)
 
 learn: $(INSTALLED)
 	@$(BIN)/python -m pytest tests/agents/test_learning.py --seeds 3 -v --durations 3
@@ -78,9 +82,8 @@ types: $(INSTALLED)
 format: $(INSTALLED)
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
-# A worker for each core; the processes that tests start must not take more than their worker's.
 check: lint rendering
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not nightly" $(TEST_ARGS)
+	@$(PYTEST) $(WORKERS) -m "not slow and not nightly" $(TEST_ARGS)
 
 nightly: rendering $(VENV)/.docs
 	@$(BIN)/python -m pytest -m nightly -v -rs $(TEST_ARGS)

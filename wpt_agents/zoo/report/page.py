@@ -89,6 +89,7 @@ def render(
         steadiness_cells=steadiness.cells,
         steadiness_headings=steadiness.HEADINGS,
         steadiness_considered=steadiness.CONSIDERED,
+        steadiness_note=steadiness.NOTE,
         policies_note=tables.POLICY_NOTE,
         rule=numbers.RULE,
         meanings={method: text for method, text in MEANINGS.items() if method in methods},

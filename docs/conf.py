@@ -39,6 +39,7 @@ add_module_names = False
 html_theme = "furo"
 html_title = f"wpt_agents {version}"
 html_show_sourcelink = False
+templates_path = ["_templates"]  # search.html has a sentence where the theme's is empty
 
 linkcheck_timeout = 30
 linkcheck_retries = 2

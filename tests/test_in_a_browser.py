@@ -194,6 +194,10 @@ def test_the_site_can_be_read(browser, site, page, width, scheme):
     assert look(browser, site / f"{page}.html", page, width, scheme) == FINE
 
 
+def test_the_search_page_says_how_to_search(site):
+    assert "Enter words in the search field" in (site / "search.html").read_text()
+
+
 def test_the_search_works_offline(browser, site):
     browser.get((site / "search.html").as_uri() + "?q=guidance")
     script = "return document.querySelectorAll('#search-results li').length"

@@ -35,6 +35,7 @@ default_role = "code"  # docstrings write `name` for code
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 add_module_names = False
+maximum_signature_line_length = 80  # longer signatures have a line for each parameter
 
 html_theme = "furo"
 html_title = f"wpt_agents {version}"

@@ -35,10 +35,12 @@ default_role = "code"  # docstrings write `name` for code
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 add_module_names = False
+maximum_signature_line_length = 80  # longer signatures have a line for each parameter
 
 html_theme = "furo"
 html_title = f"wpt_agents {version}"
 html_show_sourcelink = False
+templates_path = ["_templates"]  # search.html has a sentence where the theme's is empty
 
 linkcheck_timeout = 30
 linkcheck_retries = 2

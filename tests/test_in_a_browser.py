@@ -5,7 +5,9 @@ reaches level AA of the WCAG. Screenshots are written to the folder that the env
 SCREENSHOTS names, if it is set.
 """
 
+import inspect
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from pathlib import Path
 import pytest
 from run_folders import make_run
 
+from wpt_agents import WPT
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.page import write_page
 
@@ -192,6 +195,16 @@ def test_the_first_column_of_the_report_stays_in_a_narrow_window(browser, wide_r
 @pytest.mark.parametrize("page", PAGES)
 def test_the_site_can_be_read(browser, site, page, width, scheme):
     assert look(browser, site / f"{page}.html", page, width, scheme) == FINE
+
+
+def test_a_long_signature_has_a_line_for_each_parameter(site):
+    page = (site / "api" / "public.html").read_text()
+    lines = re.findall(r'<dd[^>]*>\s*<em class="sig-param">', page)
+    assert len(lines) > len(inspect.signature(WPT).parameters)  # methods have some, too
+
+
+def test_the_search_page_says_how_to_search(site):
+    assert "Enter words in the search field" in (site / "search.html").read_text()
 
 
 def test_the_search_works_offline(browser, site):

@@ -61,6 +61,12 @@ def test_what_needs_an_extra_says_which_in_one_sentence(code, extra):
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
+def test_a_module_of_ours_that_is_missing_is_not_called_a_missing_package():
+    broken = "import sys; sys.modules['wpt_agents.zoo.commands.app'] = None; "
+    done = python(broken + "import runpy; runpy.run_module('wpt_agents.zoo', run_name='__main__')")
+    assert "Traceback" in done.stderr and "pip install" not in done.stderr
+
+
 def test_importing_the_package_loads_no_torch():
     code = "import sys, wpt_agents; print(sorted({'torch', 'numpy', 'typer'} & {*sys.modules}))"
     assert python(code).stdout == "[]\n"

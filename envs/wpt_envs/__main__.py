@@ -47,7 +47,11 @@ def main() -> None:
     }
     try:
         run[arguments.pop("command")](**arguments)
-    except (RenderingError, ImportError, OSError) as error:  # no traceback, as in the zoo
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("wpt_envs"):
+            raise  # a fault of ours, not a missing package
+        parser.exit(2, f'Error: {error.name} is not installed: pip install "wpt-agents[sims]"\n')
+    except (RenderingError, OSError) as error:  # no traceback, as in the zoo
         parser.exit(2, f"Error: {error}\n")
 
 

@@ -108,12 +108,40 @@ def test_a_simulator_that_was_imported_first_still_draws_without_a_display(first
     assert "drawn True" in run.stdout, (run.returncode, run.stderr)
 
 
-def test_the_command_line_says_in_one_sentence_what_is_missing(monkeypatch, capsys):
+def draw_montage(monkeypatch, fault):
     def fail(**_):
-        raise headless.RenderingError("Drawing off screen needs EGL")
+        raise fault
 
     monkeypatch.setattr(sys, "argv", ["wpt_envs", "montage", "tasks.png"])
     monkeypatch.setattr(command_line, "_montage", fail)
+    command_line.main()
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        (headless.RenderingError("Drawing off screen needs EGL"), "Drawing off screen needs EGL"),
+        (
+            ModuleNotFoundError("No module named 'dm_control'", name="dm_control"),
+            'dm_control is not installed: pip install "wpt-agents[sims]"',
+        ),
+    ],
+)
+def test_the_command_line_says_in_one_sentence_what_is_missing(
+    fault, sentence, monkeypatch, capsys
+):
     with pytest.raises(SystemExit, match="2"):
-        command_line.main()
-    assert capsys.readouterr().err == "Error: Drawing off screen needs EGL\n"
+        draw_montage(monkeypatch, fault)
+    assert capsys.readouterr().err == f"Error: {sentence}\n"
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        ModuleNotFoundError("No module named 'wpt_envs.x'", name="wpt_envs.x"),
+        ImportError("cannot import name 'x' from 'wpt_envs.y'", name="wpt_envs.y"),
+    ],
+)
+def test_a_wrong_import_of_ours_keeps_its_traceback(fault, monkeypatch):
+    with pytest.raises(ImportError, match="wpt_envs"):
+        draw_montage(monkeypatch, fault)

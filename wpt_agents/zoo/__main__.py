@@ -10,6 +10,8 @@ if __name__ == "__main__":
     try:
         from wpt_agents.zoo.commands.app import main
     except ModuleNotFoundError as error:
+        if (error.name or "").startswith("wpt_agents"):
+            raise  # a fault of ours, not a missing package
         print(f'{error.name} is not installed: pip install "wpt-agents[all]"', file=sys.stderr)
         sys.exit(2)
     main()

@@ -9,6 +9,8 @@ from typing import Self
 
 import numpy as np
 
+from wpt_agents.files.archive import FAULTS
+
 EVALUATIONS = "evaluations.npz"
 MONITOR = "0.monitor.csv"
 
@@ -30,12 +32,19 @@ class Evaluations:
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
-        """Read the file; return None if it does not exist."""
+        """Read the file; return None if it does not exist.
+
+        :raises ValueError: if the file is damaged
+        """
         if not path.exists():
             return None
-        with np.load(path) as arrays:  # NumPy's default allow_pickle=False
-            successes = arrays["successes"] if "successes" in arrays else None
-            return cls(arrays["timesteps"], arrays["results"], arrays["ep_lengths"], successes)
+        try:
+            # NumPy's default is allow_pickle=False; it leaves a damaged file open that it opened.
+            with open(path, "rb") as file, np.load(file) as arrays:
+                successes = arrays["successes"] if "successes" in arrays else None
+                return cls(arrays["timesteps"], arrays["results"], arrays["ep_lengths"], successes)
+        except FAULTS as error:
+            raise damaged(path, error) from None
 
 
 @dataclass(frozen=True)
@@ -53,15 +62,28 @@ class TrainingEpisodes:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read the file, which may not exist yet; an incomplete last line is ignored."""
+        """Read the file, which may not exist yet; an incomplete last line is ignored.
+
+        :raises ValueError: if the file is damaged
+        """
         rows = []
-        if path.exists():
-            for line in path.read_text(encoding="utf-8").splitlines(keepends=True)[2:]:
+        try:
+            text = path.read_text(encoding="utf-8") if path.exists() else ""
+            for line in text.splitlines(keepends=True)[2:]:
                 cells = line.split(",")
                 if line.endswith("\n") and len(cells) >= 3 and cells[0] != "r":
                     rows.append([float(cell) for cell in cells[:3]])
+        except ValueError as error:
+            raise damaged(path, error) from None
         returns, lengths, times = np.array(rows).reshape(-1, 3).T
         return cls(lengths, returns, times)
 
     def __len__(self) -> int:
         return len(self.lengths)
+
+
+def damaged(path: Path, error: Exception) -> ValueError:
+    """Return the error for a damaged file that a run's scores do not depend on."""
+    return ValueError(
+        f"{path} is damaged ({error!r}); restore it from a copy, or delete it to go on without it"
+    )

@@ -185,6 +185,22 @@ def test_a_case_that_cannot_be_imported_says_what_it_needs(monkeypatch):
     assert ran.exit_code == 0 and "bench data is left out: it needs h5py" in ran.stderr
 
 
+@pytest.mark.parametrize("words", [["data"], []])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        ModuleNotFoundError("No module named 'wpt_agents.x'", name="wpt_agents.x"),
+        ImportError("cannot import name 'x' from 'wpt_agents.y'", name="wpt_agents.y"),
+    ],
+)
+def test_a_wrong_import_of_ours_is_not_called_a_missing_package(fault, words, monkeypatch):
+    def broken(name, package=None):
+        raise fault
+
+    monkeypatch.setattr("wpt_agents.zoo.commands.bench.importlib.import_module", broken)
+    assert CliRunner().invoke(app, ["bench", *words, "--quick"]).exception is fault
+
+
 @pytest.mark.parametrize(
     ("case", "option"),
     [

@@ -86,6 +86,12 @@ def fail(error):
             "Error: Reading HDF5 needs h5py: pip install h5py\n",
             2,
         ),
+        (
+            ImportError("cannot import name 'x' from 'wpt_agents.y'", name="wpt_agents.y"),
+            "Error: ImportError: cannot import name 'x' from 'wpt_agents.y' (add --debug to see "
+            "where, and please report it)\n",
+            1,
+        ),
         (RenderingError("Drawing needs EGL"), "Error: Drawing needs EGL\n", 2),
         (FloatingPointError("The loss is nan"), "Error: The loss is nan\n", 2),
         (

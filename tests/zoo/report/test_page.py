@@ -303,6 +303,7 @@ def test_evaluations_without_successes_are_not_drawn_as_success_rates(tmp_path):
     with np.load(folder / "evaluations.npz") as stored:
         arrays = {name: stored[name] for name in stored if name != "successes"}
     np.savez(folder / "evaluations.npz", **arrays)
+    [run] = find_finished(tmp_path)
     assert run.evaluations() is None
 
 

@@ -37,8 +37,8 @@ All commands: python -m wpt_agents.zoo --help. One command: python -m wpt_agents
 PROGRAM = "python -m wpt_agents.zoo"
 DEBUG = "--debug"
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C ended; typer returns it, too
-# Errors whose messages say what to do: wrong values, files, packages, a loss that is not finite.
-OF_USERS = (ValueError, OSError, ImportError, FloatingPointError)
+# Errors whose messages say what to do: wrong values, files, a loss that is not finite.
+OF_USERS = (ValueError, OSError, FloatingPointError)
 # The first versions of Python without the simulators, as in pyproject.toml.
 UNAVAILABLE_FROM = {"dm_control": (3, 13), "metaworld": (3, 14), "gymnasium_robotics": (3, 14)}
 
@@ -101,16 +101,18 @@ def main() -> None:
 
 def explain(error: Exception) -> tuple[str, int]:
     """Return the sentence that describes an error, and the exit code."""
-    if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("wpt_"):
-        return missing(error.name or str(error)), 2
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("wpt_"):
+        return missing(error.name), 2
     if hasattr(error, "format_message"):  # typer's error for a wrong option or value
         context = getattr(error, "ctx", None)
         command = context.command_path if context else PROGRAM
         sentence = error.format_message().replace("Value error, ", "").rstrip(".")
         return sentence and f"{sentence} (see {command} --help)", 2
     kind = type(error)
-    of_user = isinstance(error, OF_USERS) and not isinstance(error, ModuleNotFoundError)
-    if of_user or kind.__module__.startswith("wpt_envs."):
+    # An import that fails sets the name of the module. An ImportError without one was raised on
+    # purpose, by us or by another library, and says which package to install.
+    remedy = isinstance(error, ImportError) and error.name is None
+    if remedy or isinstance(error, OF_USERS) or kind.__module__.startswith("wpt_envs."):
         return str(error), 2
     return f"{kind.__name__}: {error} (add {DEBUG} to see where, and please report it)", 1
 

@@ -77,7 +77,7 @@ def report(
         if not sequences:
             return
     if not results and not sequences:
-        raise ValueError(f"No finished run below {folder}: there is no result.json.")
+        raise ValueError(f"No finished run below {folder}: there is no readable result.json.")
     rows = tables.summarise(results)
     policies = tables.policies(results)
     parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
@@ -91,7 +91,7 @@ def report(
         typer.echo(as_markdown, nl=False)
     else:
         page = (out or folder / "report") / "index.html"
-        write_page(folder, page, media)
+        write_page(folder, page, media, runs)
         _write_beside(page, {"report.md": as_markdown, "policies.csv": tables.policy_csv(policies)})
         if rows:
             console.print(tables.summary_table(rows))

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.table import Table
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.report import figures
-from wpt_agents.zoo.report.folders import check_new
+from wpt_agents.zoo.report.folders import check_new, unless_damaged
 from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.report.tables import markdown_table
@@ -66,10 +67,10 @@ def find_sequences(folder: Path) -> list[Finished]:
     finished = []
     seen: dict[object, Path] = {}
     for path in sorted(file.parent for file in folder.glob(f"**/{FILE}")):
-        result = read_sequence(path)
-        assert result is not None, path
-        check_new(result.identity, path, seen)
-        finished.append((path, result))
+        result = unless_damaged(read_sequence, path)
+        if result is not None:
+            check_new(result.identity, path, seen)
+            finished.append((path, result))
     return finished
 
 
@@ -123,11 +124,8 @@ def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finishe
             name: [(path, result) for path, result in runs if len(result.rows) > place]
             for name, runs in methods.items()
         }
-        lines = [
-            curve(name, [_curve(*run, task) for run in runs])
-            for name, runs in runs_of.items()
-            if runs
-        ]
+        seeds_of = {name: _curves(runs, task) for name, runs in runs_of.items()}
+        lines = [curve(name, seeds) for name, seeds in seeds_of.items() if seeds]
         if lines:
             curves.append(figures.lines(task, "simulator frames", "return", lines, list(methods)))
     return Figure4(
@@ -173,11 +171,19 @@ def _matrix(name: str, finished: Sequence[Finished], share: float | None) -> Mat
     return Matrix(name, [result.seed for result in results], rows, results[0].command, share)
 
 
-def _curve(folder: Path, result: SequenceResult, task: str) -> tuple[np.ndarray, np.ndarray]:
+def _curves(runs: Sequence[Finished], task: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the curves of a task, without those whose file is damaged."""
+    curves = [unless_damaged(partial(_curve, result, task), path) for path, result in runs]
+    return [one for one in curves if one is not None]
+
+
+def _curve(result: SequenceResult, task: str, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return frames (N,) and returns (N, episodes) of learning one task.
 
     They are the evaluations, or means of training episodes if there are none; N is 0 if learning
     ended within the first episode.
+
+    :raises ValueError: if the file is damaged
     """
     repeat = result.frames / result.steps
     evaluated = Evaluations.read(folder / task / EVALUATIONS)

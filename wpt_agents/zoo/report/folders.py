@@ -1,16 +1,35 @@
-"""Read run folders for a report."""
+"""Read run folders for a report. A damaged file is left out with a warning that names it."""
 
 import base64
+import json
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import imageio.v3 as imageio
 import numpy as np
 
-from wpt_agents.zoo.learning_curves import EVALUATIONS, Evaluations
+from wpt_agents.zoo.learning_curves import EVALUATIONS, Evaluations, damaged
 from wpt_agents.zoo.report.aggregates import Experiment
 from wpt_agents.zoo.result import FILE, Result, read_result
 from wpt_agents.zoo.sequence_result import read_sequence
+
+Content = TypeVar("Content")
+
+
+def unless_damaged(read: Callable[[Path], Content], path: Path) -> Content | None:
+    """Return what `read` reads; None, with a warning, if it raises a ValueError.
+
+    So a damaged file of one run does not hide the other runs.
+    """
+    try:
+        return read(path)
+    except ValueError as error:
+        warnings.warn(f"Left out: {error}", stacklevel=1)
+        return None
 
 
 @dataclass(frozen=True)
@@ -42,15 +61,23 @@ class Finished:
         if (video := self.folder / "policy.mp4").exists():
             entries["policy"] = data_uri("video/mp4", video.read_bytes())
         for name in ("predictions", "retrieval"):
-            if (picture := self.folder / f"{name}.png").exists():
-                pixels = imageio.imread(picture)[..., :3]
+            pixels = unless_damaged(_read_picture, self.folder / f"{name}.png")
+            if pixels is not None:
                 small = imageio.imwrite("<bytes>", pixels, extension=".jpg", quality=88)
                 entries[name] = data_uri("image/jpeg", small)
         return entries
 
+    def system(self) -> Any:
+        """Return the content of `system.json`, None if there is none."""
+        return unless_damaged(_read_system, self.folder / "system.json")
+
+    @cached_property
+    def _evaluations(self) -> Evaluations | None:
+        return unless_damaged(Evaluations.read, self.folder / EVALUATIONS)
+
     def evaluations(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return frames (N,) and scores (N, episodes), which are successes for such tasks."""
-        stored = Evaluations.read(self.folder / EVALUATIONS)
+        stored = self._evaluations
         if stored is None:
             return None
         scores = stored.successes if self.result.metric == "success" else stored.returns
@@ -62,7 +89,10 @@ class Finished:
 
 @dataclass(frozen=True)
 class Unfinished:
-    """A run folder without a result; `error` is empty if it was killed or is still running."""
+    """A run folder without a readable result.
+
+    :param error: empty if the run was killed or is still running
+    """
 
     folder: Path
     error: str
@@ -78,6 +108,23 @@ def data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
+def _read_picture(path: Path) -> np.ndarray | None:
+    """Return the colours of a picture, (height, width, 3); None if there is no such file."""
+    if not path.exists():
+        return None
+    try:
+        return np.asarray(imageio.imread(path.read_bytes(), plugin="pillow")[..., :3])
+    except (OSError, ValueError, SyntaxError) as error:  # the last one by Pillow
+        raise damaged(path, error) from None
+
+
+def _read_system(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    except ValueError as error:
+        raise damaged(path, error) from None
+
+
 def find_finished(folder: Path) -> list[Finished]:
     """Return every finished run below `folder`, in the order of their paths.
 
@@ -86,10 +133,10 @@ def find_finished(folder: Path) -> list[Finished]:
     runs = []
     seen: dict[object, Path] = {}
     for path in sorted(folder.glob(f"**/{FILE}")):
-        result = read_result(path.parent)
-        assert result is not None, path
-        check_new(result.identity, path.parent, seen)
-        runs.append(Finished(path.parent, result))
+        result = unless_damaged(read_result, path.parent)
+        if result is not None:
+            check_new(result.identity, path.parent, seen)
+            runs.append(Finished(path.parent, result))
     return runs
 
 
@@ -109,14 +156,19 @@ def read_results(folder: Path) -> list[Result]:
 
 
 def find_unfinished(folder: Path) -> list[Unfinished]:
-    """Return every run folder below `folder` that has no result yet."""
-    entries = []
-    for path in sorted(folder.glob("**/config.yaml")):
-        sequence = read_sequence(path.parent)
-        finished = (path.parent / FILE).exists() or (sequence is not None and sequence.finished)
-        if not finished:
-            error = path.parent / "error.txt"
-            entries.append(
-                Unfinished(path.parent, error.read_text(encoding="utf-8") if error.exists() else "")
-            )
-    return entries
+    """Return every run folder below `folder` that has no result yet, or a damaged one."""
+    folders = [path.parent for path in sorted(folder.glob("**/config.yaml"))]
+    errors = ((path, _error(path)) for path in folders)
+    return [Unfinished(path, error) for path, error in errors if error is not None]
+
+
+def _error(folder: Path) -> str | None:
+    """Return the error of a run without a readable result, "" if unknown; None if it finished."""
+    try:
+        sequence = read_sequence(folder)
+        if read_result(folder) is not None or (sequence is not None and sequence.finished):
+            return None
+    except ValueError as error:
+        return str(error)
+    path = folder / "error.txt"
+    return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""

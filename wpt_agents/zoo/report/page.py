@@ -1,6 +1,5 @@
 """The report as one HTML page, which works offline and without scripts."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -36,15 +35,19 @@ def check_media(media: str) -> None:
         raise unknown_name("choice of media", media, MEDIA)
 
 
-def write_page(folder: Path, path: Path, media: str = "first") -> None:
+def write_page(
+    folder: Path, path: Path, media: str = "first", runs: Sequence[Finished] | None = None
+) -> None:
     """Write the page about all runs below `folder` to `path` atomically.
 
     :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
         seed of its best-known method), or of "none"; they make up most of the page's size
+    :param runs: the finished runs, if they have been read already
     """
     check_media(media)
     sequences = figure4.find_sequences(folder)
-    page = render(find_finished(folder), find_unfinished(folder), media, sequences)
+    runs = find_finished(folder) if runs is None else runs
+    page = render(runs, find_unfinished(folder), media, sequences)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
@@ -86,6 +89,7 @@ def render(
         steadiness_cells=steadiness.cells,
         steadiness_headings=steadiness.HEADINGS,
         steadiness_considered=steadiness.CONSIDERED,
+        steadiness_note=steadiness.NOTE,
         policies_note=tables.POLICY_NOTE,
         rule=numbers.RULE,
         meanings={method: text for method, text in MEANINGS.items() if method in methods},
@@ -134,7 +138,7 @@ class Card:
 def card(run: Finished, names: Names, pictures: bool) -> Card:
     """Return the card of a run."""
     result = run.result
-    system = json.loads(run.text("system.json") or "{}")
+    system = run.system()
     return Card(
         id=run.name,
         name=names(run.experiment),

@@ -19,6 +19,11 @@ HEADINGS = (
     *("task", "method", "preset", "seed", "evaluations", "episodes in each", "from frame"),
     *("mean", "worst", "last"),
 )
+NOTE = (
+    "A run can make updates after its last evaluation, for example those that follow its last "
+    'episode. So the column "last" may show an earlier policy than the one that is scored at the '
+    "end."
+)
 
 
 @dataclass(frozen=True)
@@ -64,8 +69,8 @@ def cells(row: Steadiness) -> list[str]:
 
 
 def markdown(rows: Sequence[Steadiness]) -> str:
-    """Return the rows as a Markdown table with a heading; empty if there are none."""
+    """Return the rows as a Markdown table with a heading and a note; empty if there are none."""
     if not rows:
         return ""
     title = f"### The last evaluations in the second half of each run, {CONSIDERED} at most"
-    return f"{title}\n\n{markdown_table(HEADINGS, map(cells, rows))}"
+    return f"{title}\n\n{markdown_table(HEADINGS, map(cells, rows))}\n{NOTE}\n"

@@ -93,16 +93,30 @@ def diagnose_model(
     episodes: Annotated[int, typer.Option(min=1, help="The number of episodes.")] = 5,
     horizon: Annotated[int, typer.Option(min=1, help="The number of steps to predict.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
+    update: Annotated[
+        int,
+        typer.Option(min=0, help="The update of fine-tuning whose logged values are shown."),
+    ] = 600,
     device: Device = "auto",
 ) -> None:
     """Compare the rewards and values that a model predicts with the rewards that it then earns.
 
+    Of a run folder, a second table has the last values of reward error and entropy that were logged
+    up to --update, the largest difference between imagined and earned reward, and the prior actor.
+
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
-    from wpt_agents.zoo.judge.diagnosis import diagnose, show
+    from wpt_envs.tasks import TASKS
+
+    from wpt_agents.zoo.judge import diagnosis, readings
     from wpt_agents.zoo.judge.trained import find_trained
 
-    show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
+    trained = find_trained(run, task)
+    made = diagnosis.diagnose(trained, episodes, seed, horizon, device)
+    diagnosis.show(made, horizon)
+    if run.is_dir():
+        actions = TASKS[trained.task].action_dim
+        readings.show(readings.readings(run, made.promises, actions, update))
 
 
 def judge_predictions(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from wpt_agents.zoo.commands.options import Device, print_table
+from wpt_agents.zoo.commands.options import Device, Rendering, Suite, Tasks, print_table
 
 RunFolder = Annotated[
     Path,
@@ -154,6 +154,39 @@ def judge_predictions(
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
         typer.echo(f"Pictures: {out.resolve()}")
+
+
+def probe_latents(
+    model: Annotated[str, typer.Argument(help="A model file, or the name of a shipped model.")],
+    suite: Suite = "dmc",
+    tasks: Tasks = [],  # noqa: B006
+    episodes: Annotated[
+        int,
+        typer.Option(
+            min=2, help="The number of episodes of each task: half to fit on, half to test on."
+        ),
+    ] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the episodes.")] = 1000,
+    rendering: Annotated[Rendering, typer.Option(help="The quality of the images.")] = (
+        Rendering.fast
+    ),
+    device: Device = "auto",
+) -> None:
+    """Measure how well the simulator's state can be read from a world model's latent states.
+
+    A ridge regression predicts quantities such as the angle of a pole. R² is 1 if it is perfect and
+    0 if it is no better than the mean; beside it is that of an untrained model of the same size.
+
+    Example: `python -m wpt_agents.zoo probe metaworld-mid --suite metaworld --tasks drawer-open`
+    """
+    from wpt_agents.agents.wpt import WPT
+    from wpt_agents.zoo.judge.probes import beside_untrained
+    from wpt_agents.zoo.tasks import find_tasks
+
+    ids = [row.id for row in find_tasks(suite, tasks)]
+    loaded = WPT.load(model, device=device)
+    rows = beside_untrained(loaded, ids, episodes, seed, str(rendering))
+    print_table("R² of linear probes on test episodes", list(rows))
 
 
 def push_run(

@@ -59,7 +59,9 @@ def readings(
         floor = f"{narrowest_entropy(actions):.2f} with the smallest standard deviations"
         rows.append(Reading(what, f"{entropy.value:.2f}", floor))
     what = "imagined reward of the same actions, largest difference"
-    rows.append(Reading(what, f"{100 * largest_difference(promised):.0f} %", "of the earned reward"))
+    rows.append(
+        Reading(what, f"{100 * largest_difference(promised):.0f} %", "of the earned reward")
+    )
     result = read_result(folder)
     if result is not None and PRIOR_ACTOR in result.scores:
         metric = "success rate" if result.metric == "success" else "mean return"

@@ -10,6 +10,8 @@ from zoo_command import call
 
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.runs import make_plan
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.result import Variant
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
@@ -112,6 +114,36 @@ def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys
     assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
     printed = capsys.readouterr()
     assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
+
+
+def test_a_dry_run_marks_the_runs_that_a_record_has(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "mid.csv"
+    words = ["run", "--suite", "metaworld", "--tasks", "hammer", "reach", "--preset", "mid"]
+    words += ["--method", "wpt+", "--seeds", "2", "--dry-run", "--out", tmp_path / "runs"]
+    where = "metaworld", "metaworld-hammer", "wpt+", 1, Variant.parse("mid"), 12_000
+    record.update(path, [record.Line(*where, 50.0, 500.0, 0.5, 0.4, "c", "x")])
+    assert call(monkeypatch, *words, "--record", path) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("to do") == 4 + 1 and printed.count("recorded") == 1  # and a summary
+    (row,) = (line for line in printed.splitlines() if "recorded" in line)
+    assert "hammer" in row and "│ 1 " in row
+    assert call(monkeypatch, *words, "--record", path, "--frames", "6000") == 0
+    assert "recorded" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--record", "a.txt"], "a record is a .csv"),
+        (["--record", "a.csv", "--watch"], "cannot be combined with"),
+        (["--record", "a.csv", "--sequence", "ant"], "cannot be combined with"),
+    ],
+)
+def test_a_record_that_would_not_be_written_is_refused(
+    words, message, monkeypatch, capsys, tmp_path
+):
+    assert call(monkeypatch, "run", "--preset", "debug", "--out", tmp_path, *words) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):

@@ -61,10 +61,8 @@ def report(
     from wpt_agents.zoo.report.steadiness import steadiness
     from wpt_agents.zoo.terminal import console
 
-    if record is not None and record.suffix != ".csv":
-        raise ValueError(
-            f"--record {record}: a record is a .csv; its .md and .png are written beside it"
-        )
+    if record is not None:
+        records.check_path(record)
     check_media(media)
     runs = find_finished(folder)
     results = [run.result for run in runs]

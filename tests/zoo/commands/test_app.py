@@ -4,10 +4,13 @@ import json
 
 import pytest
 import yaml
+from debug_agent import recorded
 from dot_runs import SECTIONS, dot  # noqa: F401  (dot registers the task for each test)
 from typer.main import get_command
 from zoo_command import call
 
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.report import record
@@ -107,6 +110,26 @@ def test_pretrain_refuses_a_preset_that_starts_from_a_shipped_model(monkeypatch,
     assert call(monkeypatch, "pretrain", *words) == 2
     assert "--set pretrain.model= to pre-train another" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pre_trained_model_can_be_shared_as_the_shipped_ones_are(monkeypatch, capsys, tmp_path):
+    store, shared = tmp_path / "data", tmp_path / "toy-mid.zip"
+    with TrajectoryDataset.create(store) as dataset:
+        dataset.append(recorded(20))
+    words = [
+        "--preset",
+        "debug",
+        "--data",
+        store,
+        "--set",
+        "batch_size=2",
+        "--set",
+        "batch_length=4",
+    ]
+    words += ["--out", tmp_path, "--share", shared]
+    assert call(monkeypatch, "pretrain", *words) == 0
+    assert f"To share: {shared}" in capsys.readouterr().out
+    assert WPT.load(shared).pretrain_steps == 3 and shared.stat().st_size < 1e6
 
 
 def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):

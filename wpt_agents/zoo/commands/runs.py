@@ -145,15 +145,24 @@ def pretrain_model(
             min=1, help="The number of parts in which a batch is processed, to save memory."
         ),
     ] = 1,
+    share: Annotated[
+        Path | None,
+        typer.Option(
+            help="A file to write encoder, dynamics and decoder to in the end, in bfloat16, which "
+            "`WPT.load` reads like the models that come with the library."
+        ),
+    ] = None,
 ) -> None:
     """Pre-train a world model with the settings of a preset, on its data or yours.
 
-    `run` with the same preset and data reuses the model.
+    `run` with the same preset and data reuses the model. Ctrl-C saves it, and the same command
+    continues.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
 
     On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
+    from wpt_agents.agents.wpt import WPT
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device, choose_threads
     from wpt_agents.zoo.plan.effects import check_effects, from_shipped
@@ -178,6 +187,9 @@ def pretrain_model(
         model = pretrain(shared, dataset).resolve()
         if world.rank == 0:
             typer.echo(f"Model: {model}")
+            if share is not None:
+                WPT.load(model, device="cpu").save_world_model(share)
+                typer.echo(f"To share: {share.resolve()}")
 
 
 def run_benchmark(

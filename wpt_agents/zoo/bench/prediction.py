@@ -88,7 +88,7 @@ def rows(
         generalist and of each robot's specialist
     :param settings: keywords of WPT for the world models, as "key=value"
     :param robots: probe only these; the generalist is trained on all robots nevertheless
-    :raises ValueError: if `robots` are given without `probe`, or if the data have none of them
+    :raises ValueError: if there are `robots` without `probe`, or if the data have none of them
     """
     if robots and not probe:
         raise ValueError("--robot has no effect without --probe: leave it out, or pass both")

@@ -148,6 +148,7 @@ def test_a_dry_run_marks_the_runs_that_a_record_has(monkeypatch, capsys, tmp_pat
     assert call(monkeypatch, *words, "--record", path) == 0
     printed = capsys.readouterr().out
     assert printed.count("to do") == 4 + 1 and printed.count("recorded") == 1  # and a summary
+    assert "has 1 of 4 runs" in printed
     (row,) = (line for line in printed.splitlines() if "recorded" in line)
     assert "hammer" in row and "│ 1 " in row
     assert call(monkeypatch, *words, "--record", path, "--frames", "6000") == 0

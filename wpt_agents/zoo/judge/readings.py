@@ -93,7 +93,7 @@ def narrowest_entropy(actions: int) -> float:
 
 
 def largest_difference(promised: Sequence[Promise]) -> float:
-    """Return the largest |imagined - earned| / |earned| for the actions that were executed."""
+    """Return the largest `|imagined - earned| / |earned|` for the actions that were executed."""
     return max(
         abs(p.same_actions - p.earned) / abs(p.earned) if p.earned else float("inf")
         for p in promised

@@ -234,7 +234,7 @@ def run_benchmark(
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import make_sequences
-    from wpt_agents.zoo.report.record import check_path
+    from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
@@ -250,7 +250,7 @@ def run_benchmark(
     if record is not None:
         if sequence or watch:
             raise ValueError("--record cannot be combined with --sequence or --watch")
-        check_path(record)
+        record_page.check(record)
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")

@@ -83,16 +83,6 @@ def identity_of(job: Run) -> Identity:
     return short_name(job.task), job.method, str(job.variant), frames, job.seed
 
 
-def check_path(path: Path) -> None:
-    """Raise an error if `path` cannot be a record, or is none."""
-    if path.suffix != ".csv":
-        raise ValueError(
-            f"--record {path}: a record is a .csv; its .md and .png are written beside it"
-        )
-    if path.exists():
-        read(path)
-
-
 def lines_of(runs: Iterable[Finished]) -> list[Line]:
     """Return the lines of run folders; untrained policies once per task and seed."""
     last = sorted(runs, key=lambda run: run.result.method == "wpt")  # its prior actor is shown

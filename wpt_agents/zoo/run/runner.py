@@ -19,7 +19,6 @@ from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import record_page, tables
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.record import lines_of
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run.checkpoints import LOGS, Checkpoint, last_checkpoint, remove_checkpoints
 from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
@@ -63,7 +62,7 @@ def run(job: Run, force: bool = False) -> Result:
     """Execute the unfinished stages of a run, record its result if wanted, and return it."""
     result = _finish(job, force)
     if job.record is not None:
-        record_page.update(job.record, lines_of([Finished(job.folder, result)]))
+        record_page.add(job.record, [Finished(job.folder, result)])
     return result
 
 

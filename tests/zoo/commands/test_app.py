@@ -4,12 +4,17 @@ import json
 
 import pytest
 import yaml
+from debug_agent import recorded
 from dot_runs import SECTIONS, dot  # noqa: F401  (dot registers the task for each test)
 from typer.main import get_command
 from zoo_command import call
 
+from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.runs import make_plan
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.result import Variant
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
@@ -107,11 +112,62 @@ def test_pretrain_refuses_a_preset_that_starts_from_a_shipped_model(monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_pre_trained_model_can_be_shared_as_the_shipped_ones_are(monkeypatch, capsys, tmp_path):
+    store, shared = tmp_path / "data", tmp_path / "toy-mid.zip"
+    with TrajectoryDataset.create(store) as dataset:
+        dataset.append(recorded(20))
+    words = [
+        "--preset",
+        "debug",
+        "--data",
+        store,
+        "--set",
+        "batch_size=2",
+        "--set",
+        "batch_length=4",
+    ]
+    words += ["--out", tmp_path, "--share", shared]
+    assert call(monkeypatch, "pretrain", *words) == 0
+    assert f"To share: {shared}" in capsys.readouterr().out
+    assert WPT.load(shared).pretrain_steps == 3 and shared.stat().st_size < 1e6
+
+
 def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys, tmp_path):
     words = ["--tasks", "walker-run", "--device", "cuda:99", "--preset", "debug", "--dry-run"]
     assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
     printed = capsys.readouterr()
     assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
+
+
+def test_a_dry_run_marks_the_runs_that_a_record_has(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "mid.csv"
+    words = ["run", "--suite", "metaworld", "--tasks", "hammer", "reach", "--preset", "mid"]
+    words += ["--method", "wpt+", "--seeds", "2", "--dry-run", "--out", tmp_path / "runs"]
+    where = "metaworld", "metaworld-hammer", "wpt+", 1, Variant.parse("mid"), 12_000
+    record.update(path, [record.Line(*where, 50.0, 500.0, 0.5, 0.4, "c", "x")])
+    assert call(monkeypatch, *words, "--record", path) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("to do") == 4 + 1 and printed.count("recorded") == 1  # and a summary
+    assert "has 1 of 4 runs" in printed
+    (row,) = (line for line in printed.splitlines() if "recorded" in line)
+    assert "hammer" in row and "│ 1 " in row
+    assert call(monkeypatch, *words, "--record", path, "--frames", "6000") == 0
+    assert "recorded" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--record", "a.txt"], "a record is a .csv"),
+        (["--record", "a.csv", "--watch"], "cannot be combined with"),
+        (["--record", "a.csv", "--sequence", "ant"], "cannot be combined with"),
+    ],
+)
+def test_a_record_that_would_not_be_written_is_refused(
+    words, message, monkeypatch, capsys, tmp_path
+):
+    assert call(monkeypatch, "run", "--preset", "debug", "--out", tmp_path, *words) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys, tmp_path):

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
-from debug_agent import agent
+from debug_agent import agent, recorded
+from zoo_command import call
 
+from wpt_agents.zoo.judge import probes
 from wpt_agents.zoo.judge.probes import QUANTITIES, latents, probe, ridge_r2, watch
+from wpt_agents.zoo.terminal import console
 
 rng = np.random.default_rng(0)
 
@@ -53,3 +56,36 @@ def test_a_model_is_probed_on_episodes_that_it_was_not_fitted_on():
     probed = list(probe(model, ["wpt/dmc-walker-stand-v0"], episodes=2))
     assert [row["quantity"] for row in probed] == list(QUANTITIES["walker"])
     assert all(row["r2"] <= 1 for row in probed)
+
+
+def test_the_command_probes_a_file_beside_an_untrained_model(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(console, "_width", 160)
+    asked = []
+
+    def short(task, episodes, seed, rendering):
+        asked.append((task, episodes, seed, rendering))
+        for episode in range(episodes):
+            yield probes.Watched(recorded(8, seed=episode), rng.normal(size=(9, 24)))
+
+    monkeypatch.setattr(probes, "watch", short)
+    model = agent(max_action_dim=6)
+    model.save(tmp_path / "model.zip")
+    words = ["probe", tmp_path / "model.zip", "--tasks", "walker-run", "walker-stand"]
+    assert call(monkeypatch, *words, "--episodes", "2", "--device", "cpu") == 0
+    tasks = ["wpt/dmc-walker-run-v0", "wpt/dmc-walker-stand-v0"]
+    assert sorted(asked) == sorted((task, 2, 1000, "fast") for task in 2 * tasks)
+    printed = capsys.readouterr().out
+    assert "untrained" in printed and printed.count("torso height") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--suite", "robotics", "--tasks", "fetch-reach"], "nothing to probe"),
+        (["--tasks", "walker-run", "--episodes", "1"], "--episodes"),
+    ],
+)
+def test_what_cannot_be_probed_is_refused(words, message, tmp_path, monkeypatch, capsys):
+    agent(max_action_dim=6).save(tmp_path / "model.zip")
+    assert call(monkeypatch, "probe", tmp_path / "model.zip", *words) == 2
+    assert message in capsys.readouterr().err

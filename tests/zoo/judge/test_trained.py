@@ -80,6 +80,11 @@ def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
     assert [int(step) for step, _ in rows] == [0, 3, 7, 11, 15]  # five from 0 to 25 - 10
     returns = find_trained(folder).evaluate(find_trained(folder).load(), 1, seed).returns
     assert re.search(rf"Returns: {returns[0]:.0f}, ", printed)
+    assert (
+        re.search(r"new episode, update \d+ +│ +\d", printed) and "same actions, largest" in printed
+    )
+    assert call(monkeypatch, "diagnose", folder / "model.zip", *words) == 0
+    assert "new episode, update" not in capsys.readouterr().out  # a file alone has no log
     assert call(monkeypatch, "diagnose", folder, "--horizon", "26") == 2
     assert "shorter --horizon" in capsys.readouterr().err
 

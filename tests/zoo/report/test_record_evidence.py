@@ -47,7 +47,8 @@ def test_a_row_has_the_papers_scores_and_the_mean_of_our_seeds():
         *("random", "prior actor", "scratch", "scratch, 3x frames", "wpt+"),
     ]
     by_task = {row[0]: row[1:] for row in table}
-    assert list(by_task) == ["drawer-open", "hammer", "push", "soccer", "**mean**"]
+    means = ["**mean**", "**mean, with a gap**"]
+    assert list(by_task) == ["drawer-open", "hammer", "push", "soccer", *means]
     # Table 3: hammer has 0.07, 0.40 and 1.0 at 150k; wpt+ (60 + 80) / 2, prior actor (40 + 60) / 2
     assert by_task["hammer"] == [
         "7.0",
@@ -63,12 +64,29 @@ def test_a_row_has_the_papers_scores_and_the_mean_of_our_seeds():
 
 
 def test_each_mean_is_over_the_columns_tasks_and_the_papers_over_those_of_ours():
-    *_, mean = rows(evidence.markdown(LINES))
+    *_, mean, gap = rows(evidence.markdown(LINES))
     # WPT on drawer-open, hammer, soccer, where wpt+ was run (not push): (100 + 100 + 67) / 3 = 89
-    assert mean[3] == "89.0 (3 tasks)"
-    # wpt+: (100 + 70 + 30) / 3 = 66.7; prior actor: (100 + 50 + (50 + 90) / 2) / 3 = 73.3
-    assert (mean[8], mean[5]) == ("66.7 (3 tasks)", "73.3 (3 tasks)")
+    assert mean[3] == "89.0 (67.0 to 100, 3 tasks)"
+    # wpt+: (100 + 70 + 30) / 3 = 66.7; prior actor: (100 + 50 + (50 + 90) / 2) / 3 = 73.3. One
+    # resample in 27 consists of the lowest score alone, more than the 2.5 % that are cut off
+    assert (mean[8], mean[5]) == ("66.7 (30.0 to 100, 3 tasks)", "73.3 (50.0 to 100, 3 tasks)")
     assert (mean[6], mean[7]) == ("10.0 (2 tasks)", "20.0 (1 task)")  # scratch, and 3x frames
+    # with a gap: drawer-open and hammer, where the paper has 13 33 100 and 7 40 100
+    assert (gap[1], gap[3], gap[8]) == ("10.0 (2 tasks)", "100 (2 tasks)", "85.0 (2 tasks)")
+
+
+def test_a_gap_needs_both_baselines_low_and_the_papers_wpt_high(monkeypatch):
+    low, high = {"a": 40.0, "b": 40.0, "c": 40.1, "d": 0.0}, {"a": 70.0, "b": 69.9, "c": 99.0}
+    other = {"a": 0.0, "b": 0.0, "c": 0.0, "d": 0.0}
+    for baselines in ((low, other), (other, low)):
+        paper = dict(zip(("dreamer-v3", "drq-v2"), baselines, strict=True)) | {"wpt": high}
+        scores = {"wpt+": {task: {0: 1.0} for task in "abcde"}}  # the paper does not have e
+        one = evidence.Evidence("metaworld", Variant("mid"), 12_000, scores, paper)
+        assert one.with_gap == ["a"]
+    without = evidence.Evidence(
+        "metaworld", Variant("mid"), 12_000, {"wpt+": {"b": {0: 1.0}}}, paper
+    )
+    assert "with a gap" not in evidence.table(without) + evidence.explanation(without)
 
 
 def test_tasks_that_were_run_with_changed_settings_alone_are_named():
@@ -84,17 +102,36 @@ def test_the_usual_preset_is_an_unchanged_one_even_if_only_changed_ones_ran_ours
 
 
 def test_pairs_count_tasks_by_their_common_seeds():
-    by_names = {(pair.first, pair.second): pair for pair in pairs.pairs(LINES)}
+    by_names = {(p.first, p.second): p for p in pairs.pairs(LINES) if p.where == "metaworld"}
     clone = by_names["wpt+", "prior actor"]
     # hammer ((60 - 40) + (80 - 60)) / 2 = 20, drawer-open 0, soccer by seed 0 alone: 30 - 50 = -20
     assert sorted(clone.differences) == [-20, 0, 20]
-    assert clone.cells[:6] == ["metaworld", "wpt+", "prior actor", "3", "1", "1"]
-    assert clone.cells[6:] == ["1", "0.00 (-20.0 to 20.0)", "1"]
+    # wpt+ (70 + 100 + 30) / 3, the prior actor (50 + 100 + 50) / 3
+    means = "66.7 (30.0 to 100)", "66.7 (50.0 to 100)"
+    assert clone.cells[:5] == ["metaworld", "wpt+", means[0], "prior actor", means[1]]
+    assert clone.cells[5:] == ["3", "1", "1", "1", "0.00 (-20.0 to 20.0)", "-20.0", "1"]
     # scratch has seed 0 of hammer alone: 60 - 10. A single task has no interval
-    assert by_names["wpt+", "scratch"].cells[3:] == ["1", "1", "0", "0", "50.0 (-)", "1"]
+    cells = by_names["wpt+", "scratch"].cells
+    assert cells[2:5] == ["60.0 (-)", "scratch", "10.0 (-)"]
+    assert cells[5:] == ["1", "1", "0", "0", "50.0 (-)", "50.0", "1"]
+    assert by_names["wpt+", "scratch, 3x frames"].differences == [40]  # 60 - 20
     # the paper: hammer 70 - 100, drawer-open 100 - 100, soccer 30 - 67
     assert sorted(by_names["wpt+", pairs.PAPER_WPT].differences) == pytest.approx([-37, -30, 0])
-    assert set(by_names) == {("wpt+", name) for name in ("prior actor", "scratch", pairs.PAPER_WPT)}
+    assert [second for _, second in by_names] == [
+        *("prior actor", "scratch", "scratch, 3x frames", pairs.PAPER_WPT)
+    ]
+
+
+def test_pairs_show_tasks_with_a_gap_and_those_on_which_the_prior_actor_leaves_room():
+    compared = {(p.where, p.second): p for p in pairs.pairs(LINES) if p.second == "prior actor"}
+    gap = compared["metaworld, with a gap", "prior actor"]
+    assert sorted(gap.scores) == [(70, 50), (100, 100)]  # hammer and drawer-open
+    room = compared["metaworld, prior actor below 80", "prior actor"]
+    assert sorted(room.scores) == [(30, 50), (70, 50)]  # soccer and hammer
+    assert "at least 70" in pairs.markdown(LINES) and "below 80" in pairs.markdown(LINES)
+    lines = [line("wpt+", "soccer", 30.0), line("scratch", "soccer", 10.0)]  # 67 in the paper
+    assert [pair.where for pair in pairs.pairs(lines)] == ["metaworld", "metaworld"]
+    assert "with a gap" not in pairs.markdown(lines)
 
 
 def test_five_wins_of_five_are_a_p_value_of_a_sixteenth_and_two_suites_are_added_up():
@@ -104,16 +141,41 @@ def test_five_wins_of_five_are_a_p_value_of_a_sixteenth_and_two_suites_are_added
         for i in range(tasks)
         for method, score in (("wpt+", 50.0), ("scratch", 50.0 - 10 * (i + 1)))
     ]
-    # differences 10 20 and 10 20 30, so 18 on average; p = 2 / 2^5
+    # differences 10 20 and 10 20 30, so 18 on average and 10 at least; p = 2 / 2^5
     *_, both = pairs.pairs(lines)
-    assert both.cells[:7] == ["all", "wpt+", "scratch", "5", "5", "0", "0"]
-    assert both.cells[7].startswith("18.0 (") and both.cells[8] == "0.062"
+    assert both.cells[:2] == ["all", "wpt+"] and both.cells[5:9] == ["5", "5", "0", "0"]
+    assert both.cells[9].startswith("18.0 (") and both.cells[10:] == ["10.0", "0.062"]
+
+
+def test_groups_of_tasks_of_two_suites_are_added_up_each():
+    gaps = ("metaworld", "hammer", 12_000), ("dmc", "walker-walk-hard", 40_000)
+    others = ("metaworld", "soccer", 12_000), ("dmc", "walker-stand", 40_000)
+    lines = [
+        line(method, task, score, suite=suite, frames=frames)
+        for suite, task, frames in (*gaps, *others)
+        for method, score in (("wpt+", 50.0), ("scratch", 20.0))
+    ]
+    numbers = {
+        pair.where: len(pair.scores) for pair in pairs.pairs(lines) if pair.second == "scratch"
+    }
+    assert numbers == {
+        **{"dmc": 2, "dmc, with a gap": 1, "metaworld": 2, "metaworld, with a gap": 1},
+        **{"all": 4, "all, with a gap": 2},
+    }
+
+
+KEPT = ("", 70.0), (", last", 7.0)  # the best policy and the last one of a run
 
 
 def test_pairs_never_use_a_policy_that_was_chosen_by_evaluations():
     best = [line("wpt", "hammer", 90.0), line("wpt, last", "hammer", 40.0)]
-    (pair,) = pairs.pairs([*best, line("prior actor", "hammer", 50.0)])
-    assert (pair.first, pair.differences) == ("wpt", (-10,))
+    pair = pairs.pairs([*best, line("prior actor", "hammer", 50.0)])[0]
+    assert (pair.first, pair.differences) == ("wpt", [-10])
+    longer = [line(f"scratch{end}", "hammer", score, frames=36_000) for end, score in KEPT]
+    usual = [line(f"scratch{end}", "hammer", score + 1) for end, score in KEPT]
+    (one,) = evidence.evidence([*best, *usual, *longer])
+    assert pairs.last_scores(one, "scratch, 3x frames") == {"metaworld-hammer": {0: 7.0}}
+    assert pairs.last_scores(one, "scratch") == {"metaworld-hammer": {0: 8.0}}
     assert "`METHOD, last`" in evidence.markdown(best)
     assert "`METHOD, last`" not in evidence.markdown(LINES)
 

@@ -106,6 +106,13 @@ def test_data_that_cannot_be_made_are_told_with_their_own_reason_and_the_log(tmp
         run_on("local", [one], False, Resources(workers=1))
 
 
+def test_a_job_knows_its_record_wherever_its_process_starts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one = engines._at_absolute_paths(replace(job(Path("runs")), record=Path("mid.csv")))
+    assert one.record == tmp_path / "mid.csv"
+    assert engines._at_absolute_paths(job(Path("runs"))).record is None
+
+
 def test_a_real_run_on_an_engine_leaves_the_same_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "do", do_dot)
     one = job(tmp_path, "scratch")

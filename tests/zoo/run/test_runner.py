@@ -38,6 +38,20 @@ from wpt_agents.zoo.run.shared import collect_data, pretrain
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
 
+def test_a_finished_run_is_added_to_the_record_at_once(tmp_path):
+    path = tmp_path / "results" / "toy.csv"
+    path.parent.mkdir()
+    one = replace(job(tmp_path, "scratch"), record=path)
+    result = run(one)
+    lines = record.read(path)
+    assert lines == record.lines_of(find_finished(tmp_path))
+    assert record.identity_of(one) in {line.run for line in lines}
+    assert {"toy.csv", "toy.md", "toy.png"} <= {file.name for file in path.parent.iterdir()}
+    path.unlink()
+    assert run(one) == result and record.read(path) == lines  # of a run that was finished before
+    assert one.config() == job(tmp_path, "scratch").config()
+
+
 def test_a_run_leaves_everything_in_one_folder(tmp_path):
     one = job(tmp_path, evaluate={"every": 25, "during_episodes": 2})
     result = run(one)

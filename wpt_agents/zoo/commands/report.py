@@ -40,7 +40,8 @@ def report(
     the agent.
 
     --record keeps the numbers when the run folders are deleted; a Markdown page and a picture are
-    written beside the CSV file. If FOLDER has no finished run, only these two are written again.
+    written beside the CSV file, and learning curves into its folder `curves`. If FOLDER has no
+    finished run, only these are written again.
     Sequences of tasks are in the page, but not in records.
 
     Example: `python -m wpt_agents.zoo report runs --record results.csv`
@@ -61,10 +62,8 @@ def report(
     from wpt_agents.zoo.report.steadiness import steadiness
     from wpt_agents.zoo.terminal import console
 
-    if record is not None and record.suffix != ".csv":
-        raise ValueError(
-            f"--record {record}: a record is a .csv; its .md and .png are written beside it"
-        )
+    if record is not None:
+        record_page.check(record)
     check_media(media)
     runs = find_finished(folder)
     results = [run.result for run in runs]
@@ -84,7 +83,7 @@ def report(
     parts += [steadiness_markdown(steadiness(runs)), sequence_markdown(sequences)]
     as_markdown = "\n".join(filter(None, parts))
     if record is not None and results:
-        record_page.update(record, records.lines_of(runs))
+        record_page.add(record, runs)
     if csv:
         typer.echo(tables.policy_csv(policies), nl=False)
     elif markdown:

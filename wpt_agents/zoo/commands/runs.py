@@ -43,6 +43,13 @@ SequenceName = Annotated[
         "--suite and --tasks: `ant` is Fig. 4 of the paper."
     ),
 ]
+Record = Annotated[
+    Path | None,
+    typer.Option(
+        help="A CSV file to which each run is added as soon as it is finished, as by `report "
+        "--record`; with --dry-run, the runs that it has are marked."
+    ),
+]
 Force = Annotated[bool, typer.Option(help="Replace finished runs.")]
 FromNothing = Annotated[
     bool,
@@ -138,15 +145,24 @@ def pretrain_model(
             min=1, help="The number of parts in which a batch is processed, to save memory."
         ),
     ] = 1,
+    share: Annotated[
+        Path | None,
+        typer.Option(
+            help="A file to write encoder, dynamics and decoder to in the end, in bfloat16, which "
+            "`WPT.load` reads like the models that come with the library."
+        ),
+    ] = None,
 ) -> None:
     """Pre-train a world model with the settings of a preset, on its data or yours.
 
-    `run` with the same preset and data reuses the model.
+    `run` with the same preset and data reuses the model. Ctrl-C saves it, and the same command
+    continues.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
 
     On two GPUs: `torchrun --nproc-per-node 2 -m wpt_agents.zoo pretrain --preset paper`
     """
+    from wpt_agents.agents.wpt import WPT
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device, choose_threads
     from wpt_agents.zoo.plan.effects import check_effects, from_shipped
@@ -171,6 +187,9 @@ def pretrain_model(
         model = pretrain(shared, dataset).resolve()
         if world.rank == 0:
             typer.echo(f"Model: {model}")
+            if share is not None:
+                WPT.load(model, device="cpu").save_world_model(share)
+                typer.echo(f"To share: {share.resolve()}")
 
 
 def run_benchmark(
@@ -187,6 +206,7 @@ def run_benchmark(
     workers: Workers = 2,
     device: Device = "auto",
     from_nothing: FromNothing = False,
+    record: Record = None,
     force: Force = False,
     dry_run: DryRun = False,
     watch: Watch = False,
@@ -208,10 +228,13 @@ def run_benchmark(
 
     Fig. 4: `python -m wpt_agents.zoo run --sequence ant --method wpt packnet --preset tiny`
     """
+    from dataclasses import replace
+
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import make_sequences
+    from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
@@ -224,6 +247,10 @@ def run_benchmark(
     limits = cpus, gpus, memory_gb, hours, retries
     resources = Resources(workers, *limits, address, partition)
     check_resources(engine, resources)
+    if record is not None:
+        if sequence or watch:
+            raise ValueError("--record cannot be combined with --sequence or --watch")
+        record_page.check(record)
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
@@ -232,7 +259,8 @@ def run_benchmark(
         if not do_sequences(jobs, force, dry_run):
             raise typer.Exit(1)
         return
-    runs = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
+    plan = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
+    runs = [replace(run, record=record) for run in plan]
     if watch:
         show_standings(runs)
         return

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from wpt_agents.zoo.commands.options import Device, print_table
+from wpt_agents.zoo.commands.options import Device, Rendering, Suite, Tasks, print_table
 
 RunFolder = Annotated[
     Path,
@@ -93,16 +93,30 @@ def diagnose_model(
     episodes: Annotated[int, typer.Option(min=1, help="The number of episodes.")] = 5,
     horizon: Annotated[int, typer.Option(min=1, help="The number of steps to predict.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
+    update: Annotated[
+        int,
+        typer.Option(min=0, help="The update of fine-tuning whose logged values are shown."),
+    ] = 600,
     device: Device = "auto",
 ) -> None:
     """Compare the rewards and values that a model predicts with the rewards that it then earns.
 
+    Of a run folder, a second table has the last values of reward error and entropy that were logged
+    up to --update, the largest difference between imagined and earned reward, and the prior actor.
+
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """
-    from wpt_agents.zoo.judge.diagnosis import diagnose, show
+    from wpt_envs.tasks import TASKS
+
+    from wpt_agents.zoo.judge import diagnosis, readings
     from wpt_agents.zoo.judge.trained import find_trained
 
-    show(diagnose(find_trained(run, task), episodes, seed, horizon, device), horizon)
+    trained = find_trained(run, task)
+    made = diagnosis.diagnose(trained, episodes, seed, horizon, device)
+    diagnosis.show(made, horizon)
+    if run.is_dir():
+        actions = TASKS[trained.task].action_dim
+        readings.show(readings.readings(run, made.promises, actions, update))
 
 
 def judge_predictions(
@@ -140,6 +154,39 @@ def judge_predictions(
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
         typer.echo(f"Pictures: {out.resolve()}")
+
+
+def probe_latents(
+    model: Annotated[str, typer.Argument(help="A model file, or the name of a shipped model.")],
+    suite: Suite = "dmc",
+    tasks: Tasks = [],  # noqa: B006
+    episodes: Annotated[
+        int,
+        typer.Option(
+            min=2, help="The number of episodes of each task: half to fit on, half to test on."
+        ),
+    ] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="The seed of the episodes.")] = 1000,
+    rendering: Annotated[Rendering, typer.Option(help="The quality of the images.")] = (
+        Rendering.fast
+    ),
+    device: Device = "auto",
+) -> None:
+    """Measure how well the simulator's state can be read from a world model's latent states.
+
+    A ridge regression predicts quantities such as the angle of a pole. R² is 1 if it is perfect and
+    0 if it is no better than the mean; beside it is that of an untrained model of the same size.
+
+    Example: `python -m wpt_agents.zoo probe metaworld-mid --suite metaworld --tasks drawer-open`
+    """
+    from wpt_agents.agents.wpt import WPT
+    from wpt_agents.zoo.judge.probes import beside_untrained
+    from wpt_agents.zoo.tasks import find_tasks
+
+    ids = [row.id for row in find_tasks(suite, tasks)]
+    loaded = WPT.load(model, device=device)
+    rows = beside_untrained(loaded, ids, episodes, seed, str(rendering))
+    print_table("R² of linear probes on test episodes", list(rows))
 
 
 def push_run(

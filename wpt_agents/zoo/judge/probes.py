@@ -126,7 +126,11 @@ def ridge_r2(
 
 
 def probe(
-    model: WPT, tasks: Sequence[str], episodes: int = 10, seed: int = 1000
+    model: WPT,
+    tasks: Sequence[str],
+    episodes: int = 10,
+    seed: int = 1000,
+    rendering: str = "fast",
 ) -> Iterator[dict[str, Any]]:
     """Yield a row for each quantity of a task, with the R² of predicting it from the latents.
 
@@ -136,7 +140,7 @@ def probe(
     """
     for task in tasks:
         robot = wpt_envs.TASKS[task].embodiment
-        seen = list(watch(task, episodes, seed))
+        seen = list(watch(task, episodes, seed, rendering))
         features = [latents(model, episode.trajectory) for episode in seen]
         names = QUANTITIES[robot]
         targets = [np.stack([of(e.state) for of in names.values()], 1) for e in seen]
@@ -149,3 +153,23 @@ def probe(
         )
         for name, value in zip(names, r2, strict=True):
             yield {"task": task, "quantity": name, "r2": round(float(value), 3)}
+
+
+def beside_untrained(
+    model: WPT, tasks: Sequence[str], episodes: int, seed: int, rendering: str
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of `probe`, with the R² of an untrained model of the same size.
+
+    :raises ValueError: for a task whose robot has no quantities
+    """
+    for task in tasks:
+        if (robot := wpt_envs.TASKS[task].embodiment) not in QUANTITIES:
+            known = ", ".join(QUANTITIES)
+            raise ValueError(f"{task}: there is nothing to probe of {robot}, only of {known}")
+    width = model.max_action_dim
+    untrained = WPT(
+        "WPTPolicy", size=model.policy.size, max_action_dim=width, seed=0, device=model.device
+    )
+    how = tasks, episodes, seed, rendering
+    for row, other in zip(probe(model, *how), probe(untrained, *how), strict=True):
+        yield row | {"r2, untrained": other["r2"]}

@@ -43,6 +43,7 @@ class Run:
     :param data_name: `data` as the user wrote it; `data` itself may be absolute
     :param command: the user's command, regardless of the process that executes the run
     :param sequence: the name of the sequence of tasks that the run belongs to, or empty
+    :param record: the CSV file to which the scores are added when the run is finished
     """
 
     task: Task
@@ -58,6 +59,7 @@ class Run:
     data_name: str = ""
     command: str = field(default_factory=this_command, compare=False)
     sequence: str = ""
+    record: Path | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         find_method(self.method)

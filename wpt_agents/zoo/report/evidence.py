@@ -7,17 +7,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+import numpy as np
+
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.report.aggregates import STATISTICS, normalised, references
 from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
-from wpt_agents.zoo.report.numbers import number
+from wpt_agents.zoo.report.numbers import interval_text, number
 from wpt_agents.zoo.report.record import Line, place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Variant
+from wpt_agents.zoo.statistics import bootstrap, mean
 
 PAPER = {"dreamer-v3": "DreamerV3, paper", "drq-v2": "DrQ-v2, paper", "wpt": "WPT, paper"}
 UNITS = {"dmc": "a tenth of the mean return", "metaworld": "the success rate in percent"}
+# A task with a gap: the paper's baselines have at most LOW there, its WPT at least HIGH.
+LOW = 40.0
+HIGH = 70.0
+GAP = (
+    f"on which the paper's DreamerV3 and DrQ-v2 have at most {LOW:.0f} and its WPT at least "
+    f"{HIGH:.0f}"
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,17 @@ class Evidence:
     def ours(self) -> str | None:
         """The method that the paper's mean is compared with."""
         return next((method for method in OURS if method in self.scores), None)
+
+    @property
+    def with_gap(self) -> list[str]:
+        """The tasks with a trained policy on which the paper's WPT is far above its baselines."""
+        baselines = [self.paper[method] for method in ("dreamer-v3", "drq-v2")]
+        return [
+            task
+            for task in self.tasks
+            if self.paper["wpt"].get(task, 0.0) >= HIGH
+            and all(scores.get(task, 100.0) <= LOW for scores in baselines)
+        ]
 
     def means(self, name: str) -> dict[str, float]:
         """Return the mean over seeds of each task of a column."""
@@ -121,29 +142,42 @@ def explanation(one: Evidence) -> str:
             "But where there is a column `METHOD, last`, the column `METHOD` is the policy that "
             "did best in evaluations during training. "
         )
-    text += "The last row averages every column over the tasks with a score, and counts them"
+    text += (
+        "The row of means averages every column over the tasks with a score, and shows in brackets "
+        "their number and, from three tasks on, the 95 % interval by a bootstrap over tasks"
+    )
     if one.ours is not None:
         text += f"; in the paper's columns only tasks with a score of `{one.ours}` count"
+    if one.with_gap:
+        text += f". The last row does the same for the tasks {GAP}"
     return f"{text}. Only means over the same tasks can be compared.\n"
 
 
 def table(one: Evidence) -> str:
-    """Return the table of a suite: the paper's columns, ours, and a row of means."""
+    """Return the table of a suite: the paper's columns, ours, and the rows of means."""
     columns: dict[str, list[str]] = {}
+    compared = one.tasks if one.ours is None else list(one.scores[one.ours])
     for method, title in PAPER.items():
         theirs = {task: one.paper[method][task] for task in one.tasks if task in one.paper[method]}
-        compared = one.tasks if one.ours is None else one.scores[one.ours]
         if theirs:
+            shared = {task: theirs[task] for task in compared if task in theirs}
             cells = [number(theirs.get(task)) for task in one.tasks]
-            columns[title] = [
-                *cells,
-                mean_cell([theirs[task] for task in compared if task in theirs]),
-            ]
+            columns[title] = [*cells, *mean_cells(one, shared)]
     for name, tasks in one.scores.items():
         cells = [seeds_cell(tasks.get(task, {})) for task in one.tasks]
-        columns[name] = [*cells, mean_cell(list(one.means(name).values()))]
+        columns[name] = [*cells, *mean_cells(one, one.means(name))]
     names = [*(task.removeprefix(f"{one.suite}-") for task in one.tasks), "**mean**"]
+    names += ["**mean, with a gap**"] if one.with_gap else []
     return markdown_table(["task", *columns], zip(names, *columns.values(), strict=True))
+
+
+def mean_cells(one: Evidence, scores: Mapping[str, float]) -> list[str]:
+    """Return a column's mean over all tasks, and that over the tasks with a gap if there are any.
+
+    :param scores: the column's score on each task
+    """
+    groups = [list(scores)] + ([one.with_gap] if one.with_gap else [])
+    return [mean_cell([scores[task] for task in group if task in scores]) for group in groups]
 
 
 def seeds_cell(seeds: Mapping[int, float]) -> str:
@@ -154,5 +188,17 @@ def seeds_cell(seeds: Mapping[int, float]) -> str:
 
 
 def mean_cell(scores: Sequence[float]) -> str:
-    """Write the mean over tasks: "62.5 (50 tasks)"."""
-    return f"{number(fmean(scores))} ({counted(len(scores), 'task')})" if scores else "-"
+    """Write the mean over tasks: "62.5 (50.0 to 75.0, 50 tasks)"."""
+    if not scores:
+        return "-"
+    low, high = task_interval(scores)
+    interval = "" if low is None else f"{interval_text(low, high)}, "
+    return f"{number(fmean(scores))} ({interval}{counted(len(scores), 'task')})"
+
+
+def task_interval(values: Sequence[float]) -> tuple[float | None, float | None]:
+    """Return the 95 % bootstrap interval of a mean over tasks, None below three tasks."""
+    if len(values) < 3:
+        return None, None
+    low, high = bootstrap(mean, [np.array(values)])
+    return round(float(low), 6) + 0.0, round(float(high), 6) + 0.0  # no "-0.00"

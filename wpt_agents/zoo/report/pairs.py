@@ -1,36 +1,44 @@
 """Compare two policies of a record task by task: wins, mean difference, and sign test."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-import numpy as np
-
-from wpt_agents.zoo.report.evidence import Evidence, evidence
+from wpt_agents.zoo.report.evidence import GAP, Evidence, evidence, task_interval
 from wpt_agents.zoo.report.numbers import interval_text, number
 from wpt_agents.zoo.report.record import Line
 from wpt_agents.zoo.report.tables import markdown_table
-from wpt_agents.zoo.statistics import bootstrap, mean, sign_test
+from wpt_agents.zoo.result import PRIOR_ACTOR
+from wpt_agents.zoo.statistics import sign_test
 
 PAPER_WPT = "the paper's WPT"
 PAIRS = (
-    *(("wpt+", "prior actor"), ("wpt+", "scratch"), ("wpt+", "wpt"), ("wpt+", PAPER_WPT)),
-    *(("wpt", "prior actor"), ("wpt", "scratch")),
+    *(("wpt+", PRIOR_ACTOR), ("wpt+", "scratch"), ("wpt+", "scratch, 3x frames"), ("wpt+", "wpt")),
+    *(("wpt+", "drq-v2"), ("wpt+", "jsrl-bc"), ("wpt+", PAPER_WPT)),
+    *(("wpt", PRIOR_ACTOR), ("wpt", "scratch")),
+    *(("wpt", "no-guidance"), ("no-guidance", "pretrain-only")),
 )
 EQUAL = 1e-6  # scores are rounded to two decimals, so means may differ by rounding errors
+ROOM = 80.0  # a prior actor below it leaves room for improvement
 
 
 @dataclass(frozen=True)
 class Pair:
-    """The differences between two policies, in points, one for each common task.
+    """Two policies on their common tasks.
 
-    :param differences: the first policy's mean over the seeds that both have, minus the second's
+    :param where: the suite, or "all", and the kind of tasks
+    :param scores: of the two policies, for each task; means over the seeds that both have
     """
 
-    suite: str
+    where: str
     first: str
     second: str
-    differences: tuple[float, ...]
+    scores: tuple[tuple[float, float], ...]
+
+    @property
+    def differences(self) -> list[float]:
+        """The first policy's score minus the second's, in points, for each task."""
+        return [ours - theirs for ours, theirs in self.scores]
 
     @property
     def above(self) -> int:
@@ -43,81 +51,114 @@ class Pair:
         return sum(difference < -EQUAL for difference in self.differences)
 
     @property
-    def interval(self) -> tuple[float | None, float | None]:
-        """The 95 % bootstrap interval of the mean difference over tasks, None below three tasks."""
-        if len(self.differences) < 3:
-            return None, None
-        low, high = bootstrap(mean, [np.array(self.differences)])
-        return round(float(low), 6) + 0.0, round(float(high), 6) + 0.0  # no "-0.00"
-
-    @property
     def cells(self) -> list[str]:
         """The row of a table, in the order of `HEADINGS`."""
-        n = len(self.differences)
+        n = len(self.scores)
+        ours, theirs = map(list, zip(*self.scores, strict=True))
         counts = [n, self.above, n - self.above - self.below, self.below]
-        middle = f"{number(fmean(self.differences))} ({interval_text(*self.interval)})"
-        p = f"{sign_test(self.above, self.below):.2g}"
-        return [self.suite, self.first, self.second, *map(str, counts), middle, p]
+        return [
+            *(self.where, self.first, with_interval(ours), self.second, with_interval(theirs)),
+            *(*map(str, counts), with_interval(self.differences)),
+            *(number(min(self.differences)), f"{sign_test(self.above, self.below):.2g}"),
+        ]
 
 
 HEADINGS = (
-    *("suite", "policy", "against", "tasks", "above", "equal", "below"),
-    *("mean difference (95 %, bootstrap over tasks)", "p, sign test"),
+    *("tasks", "policy", "mean (95 %)", "against", "mean (95 %)"),
+    *("number", "above", "equal", "below", "mean difference (95 %)", "smallest", "p, sign test"),
+)
+NOTE = (
+    "Only last policies with the unchanged preset and the usual budget are compared, on each task "
+    "by the mean over the seeds that both have; the paper gives means alone. The prior actor is "
+    "the one in the record, which another method may have cloned. Every task counts the same. An "
+    "interval, by a bootstrap over three tasks or more, says how much other tasks would change the "
+    'mean, not other seeds. "Smallest" is the difference on the task where it is smallest. The '
+    "sign test leaves out equal tasks."
 )
 
 
+def with_interval(values: Sequence[float]) -> str:
+    """Write a mean over tasks with its 95 % interval: "9.2 (-5.0 to 30.0)"."""
+    return f"{number(fmean(values))} ({interval_text(*task_interval(values))})"
+
+
 def pairs(lines: Sequence[Line]) -> list[Pair]:
-    """Return the comparisons that the record has a task for, on each suite and on all together."""
+    """Return the comparisons that the record has a task for, on each suite and on all together.
+
+    Each is made for all common tasks, for those with a gap in the paper, and against the prior
+    actor for those on which it is below `ROOM`.
+    """
     suites = evidence(lines)
     compared = []
     for first, second in PAIRS:
-        by_suite = [pair for one in suites if (pair := compare(one, first, second))]
+        by_suite = [pair for one in suites for pair in comparisons(one, first, second)]
         compared += by_suite
-        if len(by_suite) > 1:
-            every = tuple(d for pair in by_suite for d in pair.differences)
-            compared.append(Pair("all", first, second, every))
+        for kind in dict.fromkeys(kind_of(pair) for pair in by_suite):
+            same = [pair for pair in by_suite if kind_of(pair) == kind]
+            if len(same) > 1:
+                every = tuple(scores for pair in same for scores in pair.scores)
+                compared.append(Pair(f"all{kind}", first, second, every))
     return compared
 
 
-def compare(one: Evidence, first: str, second: str) -> Pair | None:
-    """Compare two policies on a suite, None if no task has both."""
+def kind_of(pair: Pair) -> str:
+    """Return the kind of tasks in `where`: ", with a gap", or "" for all tasks."""
+    _, comma, kind = pair.where.partition(",")
+    return comma + kind
+
+
+def comparisons(one: Evidence, first: str, second: str) -> Iterable[Pair]:
+    """Yield the comparisons of two policies on a suite for the kinds of tasks that they have."""
+    common = compare(one, first, second)
+    kinds = {"": list(common)}
+    if second != PAPER_WPT:
+        kinds[", with a gap"] = [task for task in one.with_gap if task in common]
+    if second == PRIOR_ACTOR:
+        low = [task for task, (_, clone) in common.items() if clone < ROOM]
+        kinds[f", {second} below {ROOM:.0f}"] = low
+    for kind, tasks in kinds.items():
+        if tasks:
+            scores = tuple(common[task] for task in tasks)
+            yield Pair(f"{one.suite}{kind}", first, second, scores)
+
+
+def compare(one: Evidence, first: str, second: str) -> dict[str, tuple[float, float]]:
+    """Return the scores of two policies of a suite on each task that has both."""
     ours = last_scores(one, first)
     if second == PAPER_WPT:
         theirs = one.paper["wpt"]
-        differences = [fmean(ours[task].values()) - theirs[task] for task in ours if task in theirs]
-    else:
-        others = last_scores(one, second)
-        common = {task: ours[task].keys() & others[task].keys() for task in ours if task in others}
-        differences = [
-            fmean(ours[task][seed] - others[task][seed] for seed in seeds)
-            for task, seeds in common.items()
-            if seeds
-        ]
-    return Pair(one.suite, first, second, tuple(differences)) if differences else None
+        return {task: (fmean(ours[task].values()), theirs[task]) for task in ours if task in theirs}
+    others = last_scores(one, second)
+    common = {task: ours[task].keys() & others[task].keys() for task in ours if task in others}
+    return {
+        task: (fmean(ours[task][s] for s in seeds), fmean(others[task][s] for s in seeds))
+        for task, seeds in common.items()
+        if seeds
+    }
 
 
-def last_scores(one: Evidence, method: str) -> dict[str, Mapping[int, float]]:
-    """Return task -> seed -> score of the last policies.
+def last_scores(one: Evidence, name: str) -> dict[str, dict[int, float]]:
+    """Return task -> seed -> score of the last policies of a method, such as "scratch, 3x frames".
 
     In a record, the final policy has the name of the method. It is the last policy, unless the run
     kept the best one; then the last one is named "METHOD, last".
     """
-    last = one.scores.get(f"{method}, last", {})
+    method, comma, budget = name.partition(",")
+    last = one.scores.get(f"{method}, last{comma}{budget}", {})
     return {
-        task: {**seeds, **last.get(task, {})} for task, seeds in one.scores.get(method, {}).items()
+        task: {**seeds, **last.get(task, {})} for task, seeds in one.scores.get(name, {}).items()
     }
 
 
 def markdown(lines: Sequence[Line]) -> str:
     """Return the comparisons as a table, "" if there are none."""
-    rows = [pair.cells for pair in pairs(lines)]
-    if not rows:
+    compared = pairs(lines)
+    if not compared:
         return ""
-    return (
-        "## Pairs\n\n"
-        "Only last policies with the unchanged preset and the usual budget are compared, on each "
-        "task by the mean over the seeds that both have; the paper gives means alone. The prior "
-        "actor is the one in the record, which another method may have cloned. Every task counts "
-        "the same. The interval says how much other tasks would change the mean, not other seeds; "
-        f"the sign test leaves out equal tasks.\n\n{markdown_table(HEADINGS, rows)}"
-    )
+    note = NOTE
+    kinds = {kind_of(pair) for pair in compared}
+    if ", with a gap" in kinds:
+        note += f' "With a gap" are the tasks {GAP}.'
+    if kinds - {"", ", with a gap"}:
+        note += f' "{PRIOR_ACTOR.capitalize()} below {ROOM:.0f}" are those on which it has less.'
+    return f"## Pairs\n\n{note}\n\n{markdown_table(HEADINGS, [pair.cells for pair in compared])}"

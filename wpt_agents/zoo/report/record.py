@@ -14,10 +14,14 @@ from typing import Any
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.result import PRIOR_ACTOR, UNTRAINED, Result, Variant
+from wpt_agents.zoo.tasks import short_name
+
+Identity = tuple[str, str, str, int, int]  # task, method or policy, preset, frames, seed
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,12 @@ class Line:
     policy: str = ""
 
     @property
-    def run(self) -> tuple[str, str, str, int, int]:
+    def run(self) -> Identity:
         """The identity of the line."""
         return self.task, self.method, str(self.preset), self.frames, self.seed
 
     @property
-    def agent(self) -> tuple[str, str, str, int, int]:
+    def agent(self) -> Identity:
         """The identity of the agent, which is the same for "wpt" and "wpt, last"."""
         clone = self.method.startswith(PRIOR_ACTOR)  # "prior actor, no-pretrain" is another one
         method = self.method if clone else self.method.split(",")[0]
@@ -71,6 +75,12 @@ KNOWN = (  # of methods in tables: the simplest first, then the paper's ablation
 ORDER = (*KNOWN, *(name for name in METHODS if name not in KNOWN))
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
 OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy")  # records of version 0.1 lack them
+
+
+def identity_of(job: Run) -> Identity:
+    """Return the identity of the line that the final policy of a run gets."""
+    frames = job.preset.learn.frames
+    return short_name(job.task), job.method, str(job.variant), frames, job.seed
 
 
 def lines_of(runs: Iterable[Finished]) -> list[Line]:

@@ -1,26 +1,45 @@
-"""The pages beside a record: `results.md` and `results.png` of `results.csv`."""
+"""The pages beside a record: `results.md` and `results.png` of `results.csv`, and its curves."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.report import evidence, pairs, record_picture, record_tables
+from wpt_agents.zoo.report import evidence, pairs, record_curves, record_picture, record_tables
 from wpt_agents.zoo.report import record as records
+from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.record import Line
 from wpt_agents.zoo.run.locks import locked_folder
 
 
-def update(record: Path, lines: Iterable[Line]) -> None:
-    """Add lines to a record and write its pages; several processes take turns."""
+def check(record: Path) -> None:
+    """Raise an error if a path cannot be a record, or if its files are damaged."""
+    if record.suffix != ".csv":
+        raise ValueError(
+            f"--record {record}: a record is a .csv; its .md and .png are written beside it"
+        )
+    if record.exists():
+        records.read(record)
+    record_curves.read(record)
+
+
+def add(record: Path, runs: Sequence[Finished]) -> None:
+    """Add runs to a record, and write its pages; several processes take turns."""
+    update(record, records.lines_of(runs), record_curves.points_of(runs))
+
+
+def update(record: Path, lines: Iterable[Line], points: Iterable[record_curves.Point] = ()) -> None:
+    """Add lines and curves to a record and write its pages; several processes take turns."""
     with locked_folder(record.parent):
+        record_curves.update(record, points)
         write(record, records.update(record, lines))
 
 
 def write(record: Path, lines: Sequence[Line]) -> None:
-    """Write the tables and the picture of a record beside it."""
+    """Write the tables and the pictures of a record beside it."""
     with replacing(record.with_suffix(".md")) as temporary:
         temporary.write_text(markdown(lines), encoding="utf-8")
     record_picture.draw(record.with_suffix(".png"), lines)
+    record_curves.draw(record, record_curves.read(record), lines)
 
 
 def markdown(lines: Sequence[Line]) -> str:

@@ -5,7 +5,7 @@ marker. The colours are Okabe and Ito's colour-blind safe ones.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,8 +78,7 @@ def draw_rows(suites: Sequence[Evidence]) -> Figure:
         layout="constrained",
     )
     names = dict.fromkeys(name for one in suites for name in one.scores if drawn(name))
-    others = iter(OTHERS * len(names))
-    styles = {name: STYLES.get(name) or next(others) for name in names}
+    styles = styles_of(names)
     for panel, one in zip(axes.flat, suites, strict=True):
         _draw_suite(panel, one, styles)
     legend = {
@@ -92,6 +91,12 @@ def draw_rows(suites: Sequence[Evidence]) -> Figure:
     )
     axes.flat[-1].set_xlabel("score, 0 to 100: the mean over seeds, a line from lowest to highest")
     return figure
+
+
+def styles_of(names: Collection[str]) -> dict[str, Style]:
+    """Return a style for each method."""
+    others = iter(OTHERS * len(names))
+    return {name: STYLES.get(name) or next(others) for name in names}
 
 
 def drawn(method: str) -> bool:

@@ -95,7 +95,8 @@ def clear_all(folders: Sequence[Path]) -> None:
 
 def _at_absolute_paths(job: Run) -> Run:
     data = job.data.resolve() if job.data is not None else None
-    return replace(job, out=job.out.resolve(), data=data)
+    record = job.record.resolve() if job.record is not None else None
+    return replace(job, out=job.out.resolve(), data=data, record=record)
 
 
 def make_shared(job: Run) -> None:

@@ -17,7 +17,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit, system
-from wpt_agents.zoo.report import tables
+from wpt_agents.zoo.report import record_page, tables
+from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run.checkpoints import LOGS, Checkpoint, last_checkpoint, remove_checkpoints
 from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
@@ -58,7 +59,14 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
 
 
 def run(job: Run, force: bool = False) -> Result:
-    """Execute the unfinished stages of a run, and return its result."""
+    """Execute the unfinished stages of a run, record its result if wanted, and return it."""
+    result = _finish(job, force)
+    if job.record is not None:
+        record_page.add(job.record, [Finished(job.folder, result)])
+    return result
+
+
+def _finish(job: Run, force: bool) -> Result:
     check_folder(job, force)
     done = None if force else read_result(job.folder)
     if done is not None:

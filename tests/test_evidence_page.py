@@ -1,0 +1,52 @@
+"""The commands of docs/evidence.md plan the runs that the page says, and nothing else."""
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from wpt_agents.zoo.commands.app import app
+from wpt_agents.zoo.report.evidence import HIGH, LOW, paper_scores
+from wpt_agents.zoo.run import dispatch
+from wpt_agents.zoo.tasks import short_name
+
+PAGE = (Path(__file__).parents[1] / "docs" / "evidence.md").read_text(encoding="utf-8")
+RUNS = dict(re.findall(r"^\| ([A-D]) \| (\d+) \|", PAGE, re.M))
+WITHOUT_GAP = {"metaworld-door-unlock", "dmc-cartpole-balance"}
+
+
+def planned(part, monkeypatch):
+    """Return the runs of the commands below the heading of a part."""
+    (text,) = re.findall(rf"^### {part}: .*?```bash\n(.*?)```", PAGE, re.M | re.S)
+    runs = []
+    monkeypatch.setattr(dispatch, "preview", lambda plan, *_: runs.extend(plan))
+    for command in text.replace("$RECORD", "mid.csv").splitlines():
+        words = command.removeprefix("python -m wpt_agents.zoo ").split()
+        assert CliRunner().invoke(app, [*words, "--dry-run"]).exit_code == 0, command
+    return runs
+
+
+@pytest.mark.parametrize("part", "ABCD")
+def test_each_part_has_as_many_runs_as_the_page_says(part, monkeypatch):
+    runs = planned(part, monkeypatch)
+    assert len({(run.folder, run.preset.steps) for run in runs}) == len(runs) == int(RUNS[part])
+    assert {str(run.variant) for run in runs} == {"mid"}  # others are not in the tables
+
+
+def test_part_a_is_every_task_of_the_paper_and_b_the_tasks_with_a_gap_and_two_controls(monkeypatch):
+    tasks = {short_name(run.task) for run in planned("A", monkeypatch)}
+    assert len(tasks) == 50
+    chosen = {short_name(run.task) for run in planned("B", monkeypatch)}
+    assert len(chosen) == 4 + 3 + 2
+    papers = {}
+    for suite in ("metaworld", "dmc"):
+        for method, scores in paper_scores(suite).items():
+            papers.setdefault(method, {}).update(scores)
+    with_gap = {
+        task
+        for task in chosen
+        if max(papers["dreamer-v3"][task], papers["drq-v2"][task]) <= LOW
+        and papers["wpt"][task] >= HIGH
+    }
+    assert with_gap == chosen - WITHOUT_GAP

@@ -197,7 +197,7 @@ def pre_trained(tmp_path):
 
 def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained):
     model, data = WPT.load(pre_trained / "model.zip"), TrajectoryDataset.open(pre_trained / "data")
-    rows = list(prediction.judge(model, data, episodes=2))
+    rows = list(prediction.judge({"world model": model}, data, episodes=2))
     ways = ["world model", "copy last frame", "mean frame"]
     assert [(r["robot"], r["prediction"]) for r in rows] == [
         (robot, way) for robot in ("clock 1", "clock 2") for way in ways
@@ -227,6 +227,31 @@ def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
     wide = CliRunner().invoke(app, [*words[:2], str(pre_trained / "wide")])
     assert isinstance(wide.exception, ValueError)
     assert "3 actions, the model takes at most 2: take other data" in str(wide.exception)
+
+
+def test_open_loop_compares_several_models_by_name(pre_trained):
+    agent(max_action_dim=2, seed=1).save(pre_trained / "other.zip")
+    agent(max_action_dim=3).save(pre_trained / "wider.zip")
+    other, data = f"longer={pre_trained / 'other.zip'}", pre_trained / "data"
+    words = ["open-loop", str(pre_trained), str(data), "--out", str(pre_trained / "seen")]
+    ran = CliRunner().invoke(app, [*words, "--beside", other])
+    assert ran.exit_code == 0, ran.output
+    table = pd.read_csv(pre_trained / "seen" / "prediction.csv")
+    assert list(table.prediction.unique()) == [
+        *("world model", "longer", "copy last frame", "mean frame"),
+    ]
+    of = {name: rows.error.to_numpy() for name, rows in table.groupby("prediction")}
+    assert not np.array_equal(of["world model"], of["longer"])
+    alone = list(prediction.judge({"x": WPT.load(pre_trained / "other.zip")},
+                                  TrajectoryDataset.open(data), 8))  # fmt: skip
+    assert alone[0]["+1"] == pytest.approx(of["longer"][1], abs=0.1)
+    for wrong, message in (
+        (["--beside", "other.zip"], "NAME=MODEL with a new name, not other.zip"),
+        (["--beside", other, "--beside", other], "with a new name"),
+        (["--beside", f"wider={pre_trained / 'wider.zip'}"], "wider takes 3 instead of 2"),
+    ):
+        refused = CliRunner().invoke(app, [*words, *wrong])
+        assert isinstance(refused.exception, ValueError) and message in str(refused.exception)
 
 
 ROBOTS = ("walker", "cartpole")

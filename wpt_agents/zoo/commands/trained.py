@@ -137,6 +137,14 @@ def judge_predictions(
             help="The folder for `prediction.csv` and pictures; none are written by default."
         ),
     ] = None,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=MODEL",
+            help="Another model to compare with, and its name in the table and pictures; can be "
+            "repeated.",
+        ),
+    ] = None,
     device: Device = "auto",
 ) -> None:
     """Measure how well a world model predicts: its error at each horizon, beside simple baselines.
@@ -149,8 +157,17 @@ def judge_predictions(
     from wpt_agents.data.dataset import TrajectoryDataset
     from wpt_agents.zoo.judge.prediction import judge
 
-    file = model / "model.zip" if model.is_dir() else model
-    rows = judge(WPT.load(file, device=device), TrajectoryDataset.open(data), episodes, out)
+    paths = {"world model": model}
+    for words in beside or []:
+        name, equals, path = words.partition("=")
+        if not equals or not name or name in paths:
+            raise ValueError(f"--beside must be NAME=MODEL with a new name, not {words}")
+        paths[name] = Path(path)
+    models = {
+        name: WPT.load(path / "model.zip" if path.is_dir() else path, device=device)
+        for name, path in paths.items()
+    }
+    rows = judge(models, TrajectoryDataset.open(data), episodes, out)
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
         typer.echo(f"Pictures: {out.resolve()}")

@@ -29,20 +29,31 @@ Tests = Mapping[str, Sequence[Batch]]  # by robot, the windows of each trajector
 
 
 def judge(
-    model: WPT, dataset: TrajectoryDataset, episodes: int, folder: Path | None = None
+    models: Mapping[str, WPT],
+    dataset: TrajectoryDataset,
+    episodes: int,
+    folder: Path | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Compare a world model with copying the last frame and with the mean frame, for each robot.
+    """Compare world models with copying the last frame and with the mean frame, for each robot.
 
+    :param models: world models by name; of one `max_action_dim`
     :param dataset: held-out data, whose mean frame is one of the baselines
     :param episodes: maximum number for each robot, evenly spaced over those that are long enough
     :param folder: the folder of the pictures
-    :raises ValueError: if no trajectory is long enough, or has too many actions for the model
+    :raises ValueError: if no trajectory is long enough, or has too many actions for a model
     """
     check_images(dataset)
-    if (widest := max(dataset.action_dims)) > model.max_action_dim:
+    width = next(iter(models.values())).max_action_dim
+    for name, model in models.items():
+        if model.max_action_dim != width:
+            raise ValueError(
+                f"The models must take equally many actions, and {name} takes "
+                f"{model.max_action_dim} instead of {width}: compare models of one max_action_dim"
+            )
+    if (widest := max(dataset.action_dims)) > width:
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model takes at most "
-            f"{model.max_action_dim}: take other data, or a model pre-trained for as many"
+            f"{width}: take other data, or a model pre-trained for as many"
         )
     ways: dict[str, dict[str, Predict]] = {}
     tests: dict[str, list[Batch]] = {}
@@ -58,13 +69,13 @@ def judge(
         number = min(episodes, len(candidates))
         spread = np.linspace(0, len(candidates) - 1, number).round().astype(int)
         chosen = dataset.subset(candidates[spread])
-        tests[robot] = [windows(trajectory, 3, model.max_action_dim) for trajectory in chosen]
+        tests[robot] = [windows(trajectory, 3, width) for trajectory in chosen]
         ways[robot] = {
-            "world model": dream(model),
+            **{name: dream(model) for name, model in models.items()},
             "copy last frame": copy_last_frame,
             "mean frame": MeanFrame(chosen),
         }
-    shown = [(robot, robot, ["world model"]) for robot in ways]
+    shown = [(robot, robot, list(models)) for robot in ways]
     return compare(ways, tests, folder, shown)
 
 

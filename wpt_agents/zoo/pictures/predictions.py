@@ -28,6 +28,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "from scratch": {"color": "#56b4e9", "lw": 2.4},
 }
 COMMON = tuple(STYLES)[:6]  # compared on every robot
+OTHERS = ("#d55e00", "#009e73", "#56b4e9", "#e69f00")  # colours of models that the user has named
 CAPTION = (  # of the strips, in lines that fit above a single panel
     "Upper row: what happened. Rows below: what is predicted from\n"
     "the actions alone, after the last image seen. One step is one action."
@@ -52,9 +53,14 @@ class Strip(NamedTuple):
     horizons: Sequence[int]
 
 
-def style(prediction: str) -> dict[str, Any]:
-    """Return the line style of a predictor, by its longest known prefix."""
-    return STYLES[max((name for name in STYLES if prediction.startswith(name)), key=len)]
+def style(prediction: str, rank: int = 0) -> dict[str, Any]:
+    """Return the line style of a predictor, by its longest known prefix.
+
+    :param rank: its place in the panel; a predictor of another name takes its colour by this
+    """
+    if known := [name for name in STYLES if prediction.startswith(name)]:
+        return STYLES[max(known, key=len)]
+    return {"color": OTHERS[rank % len(OTHERS)], "lw": 1.6}
 
 
 def draw_curves(
@@ -62,9 +68,12 @@ def draw_curves(
 ) -> None:
     """Draw a panel for each robot, and one for a robot that was excluded from pre-training."""
     robots = list(dict.fromkeys(curve.robot for curve in curves))
-    figure, panels = _grid(len(robots) + (left_out is not None), (3.6, 2.9))
+    legend = 0.2 * len(curves) if len(robots) == 1 else 0.0  # above a single panel, in one column
+    figure, panels = _grid(len(robots) + (left_out is not None), (3.6, 2.9 + legend))
     for axes, robot in zip(panels, robots, strict=False):
-        shown = [c for c in curves if c.robot == robot and c.prediction in COMMON]
+        shown = [c for c in curves if c.robot == robot]
+        if left_out is not None:
+            shown = [c for c in shown if c.prediction in COMMON]
         _panel(axes, robot, shown)
     if left_out is not None:
         shown = [c for c in curves if c.robot == left_out]
@@ -83,8 +92,8 @@ def draw_curves(
 
 
 def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
-    for curve in curves:
-        look = style(curve.prediction)
+    for rank, curve in enumerate(curves):
+        look = style(curve.prediction, rank)
         at = np.arange(len(curve.error))[1:]
         axes.plot(at, curve.error[1:], label=curve.prediction, **look)
         axes.fill_between(at, curve.low[1:], curve.high[1:], color=look["color"], alpha=0.13, lw=0)
@@ -102,7 +111,8 @@ def draw_strips(path: str | os.PathLike[str], strips: Sequence[Strip]) -> None:
 
     Horizon 0 is the last image that the predictors see.
     """
-    figure, panels = _grid(len(strips), (4.4, 3.0))
+    rows = max(len(strip.images) for strip in strips)
+    figure, panels = _grid(len(strips), (4.4, 1.0 + 0.67 * rows))
     for axes, strip in zip(panels, strips, strict=False):
         axes.imshow(montage(list(strip.images.values())), interpolation="nearest")
         centres = [32 + 66 * i for i in range(max(len(strip.horizons), len(strip.images)))]

@@ -14,11 +14,13 @@ from dot_runs import dot, job  # noqa: F401  (dot registers the task for each te
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
 from zoo_command import call
 
-from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.report import record
+from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run import engines
 from wpt_agents.zoo.run.engines import Local, Ray, Resources, Slurm, run_on
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.watch import standing
+from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -121,6 +123,37 @@ def test_a_real_run_on_an_engine_leaves_the_same_folder(tmp_path, monkeypatch):
     assert "evaluate" in (one.folder / "log.txt").read_text()
     assert (one.folder / "command.txt").read_text().strip() == one.command
     assert standing(one).state == "finished"
+
+
+def finish(one):
+    """Leave the folder of a finished run, without a run."""
+    one.folder.mkdir(parents=True)
+    (one.folder / "config.yaml").write_text(yaml.safe_dump(one.config()))
+    names = one.task.suite, short_name(one.task), one.method, one.variant, one.seed
+    budget = one.preset.learn.frames, one.preset.steps, "return"
+    write_result(one.folder, Result(*names, *budget, {"last": Score((1.0,))}))
+
+
+def test_an_engine_records_finished_runs_and_reports_one_that_it_could_not_record(
+    tmp_path, monkeypatch
+):
+    path = tmp_path / "toy.csv"
+    first, second = (
+        replace(job(tmp_path / "runs", "scratch", seed=seed), record=path) for seed in range(2)
+    )
+    finish(first)
+    monkeypatch.setattr(Local, "map", lambda *_: {})
+    assert run_on("local", [first], False, Resources())
+    assert {line.run for line in record.read(path)} == {record.identity_of(first)}
+
+    def fail_to_record(_, work, jobs, tick):
+        for one in jobs:
+            finish(one)
+        return {one.folder: "ValueError: no record" for one in jobs}
+
+    monkeypatch.setattr(Local, "map", fail_to_record)
+    assert not run_on("local", [first, second], False, Resources())
+    assert read_result(second.folder) is not None
 
 
 def test_force_deletes_nothing_unless_it_can_begin(jobs):

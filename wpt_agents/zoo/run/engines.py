@@ -59,7 +59,7 @@ class Resources:
 def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) -> bool:
     """Execute the runs on an engine and show their progress.
 
-    :return: True if all are finished
+    :return: True if all are finished, and recorded if wanted
     """
     check_machine(engine, jobs[0].device)
     jobs = [_at_absolute_paths(job) for job in jobs]
@@ -70,6 +70,8 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
     left = [job for job in jobs if force or read_result(job.folder) is None]
     if force:
         clear_all([job.folder for job in left])
+    # A worker may have been killed, or have failed, between its result and the record.
+    runner.record_finished([job for job in jobs if job not in left])
     by_need = sorted(left, key=lambda job: job.algorithm.pretrained)
     shared = {job.shared.model_path: job for job in by_need if job.algorithm.needs_data}
     cpus = counted(resources.cpus, "CPU")
@@ -81,7 +83,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
         errors = chosen.map(do, left, tick)
     for folder, error in errors.items():
         console.print(f"[red]failed[/red] {escape(str(folder))}: {escape(error)}")
-    return all(read_result(job.folder) for job in jobs)
+    return not errors and all(read_result(job.folder) for job in jobs)
 
 
 def clear_all(folders: Sequence[Path]) -> None:

@@ -61,9 +61,16 @@ def run_all(jobs: Sequence[Run], force: bool = False) -> bool:
 def run(job: Run, force: bool = False) -> Result:
     """Execute the unfinished stages of a run, record its result if wanted, and return it."""
     result = _finish(job, force)
-    if job.record is not None:
-        record_page.add(job.record, [Finished(job.folder, result)])
+    record_finished([job])
     return result
+
+
+def record_finished(jobs: Sequence[Run]) -> None:
+    """Add the finished ones of these runs to their record, if they have one."""
+    if not jobs or (record := jobs[0].record) is None:
+        return
+    results = ((job.folder, read_result(job.folder)) for job in jobs)
+    record_page.add(record, [Finished(folder, one) for folder, one in results if one is not None])
 
 
 def _finish(job: Run, force: bool) -> Result:

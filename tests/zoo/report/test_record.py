@@ -149,6 +149,9 @@ def test_another_csv_is_refused(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match=r"other.csv is not a record.*its columns are suite"):
         record.read(tmp_path / "other.csv")
+    (tmp_path / "other.csv").write_bytes(b"suite\n\xff\n")
+    with pytest.raises(ValueError, match=r"other.csv is not a record.*can't decode"):
+        record.read(tmp_path / "other.csv")
 
 
 def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():

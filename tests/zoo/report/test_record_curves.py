@@ -100,6 +100,9 @@ def test_runs_without_evaluations_leave_no_file_and_damaged_curves_are_named(tmp
     (tmp_path / "curves" / "mid.csv").write_text("suite,task\na,b\n")
     with pytest.raises(ValueError, match=r"curves/mid.csv does not hold learning curves"):
         record_page.add(path, find_finished(tmp_path / "runs"))
+    (tmp_path / "curves" / "mid.csv").write_bytes(b"suite\n\xff\n")
+    with pytest.raises(ValueError, match=r"curves/mid.csv does not hold .*can't decode"):
+        record_curves.read(path)
 
 
 def test_the_picture_is_drawn_again_without_run_folders(tmp_path):

@@ -154,11 +154,10 @@ def read(path: Path) -> list[Line]:
 
     :raises ValueError: if the file is no record or is damaged
     """
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
     try:
-        return [_parse(row) for row in rows]
-    except (KeyError, TypeError, ValueError) as error:
+        with open(path, newline="", encoding="utf-8") as file:
+            return [_parse(row) for row in csv.DictReader(file)]
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(
             f"{path} is not a record of runs ({error}); its columns are {', '.join(COLUMNS)}"
         ) from None

@@ -98,11 +98,10 @@ def read(record: Path) -> list[Point]:
     path = place_of(record)
     if not path.exists():
         return []
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
     try:
-        return [_parse(row) for row in rows]
-    except (KeyError, TypeError, ValueError) as error:
+        with open(path, newline="", encoding="utf-8") as file:
+            return [_parse(row) for row in csv.DictReader(file)]
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} does not hold learning curves ({error}); delete it") from None
 
 

@@ -81,7 +81,8 @@ def test_the_command_probes_a_file_beside_an_untrained_model(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--suite", "robotics", "--tasks", "fetch-reach"], "nothing to probe"),
+        (["--suite", "robotics", "--tasks", "fetch-reach"], "no quantities to probe"),
+        (["--tasks", "quadruped-walk"], "has 12 actions, the model takes at most 6"),
         (["--tasks", "walker-run", "--episodes", "1"], "--episodes"),
     ],
 )

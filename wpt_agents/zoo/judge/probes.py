@@ -160,13 +160,19 @@ def beside_untrained(
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of `probe`, with the R² of an untrained model of the same size.
 
-    :raises ValueError: for a task whose robot has no quantities
+    :raises ValueError: for a task whose robot has no quantities, or more actions than the model
     """
-    for task in tasks:
-        if (robot := wpt_envs.TASKS[task].embodiment) not in QUANTITIES:
-            known = ", ".join(QUANTITIES)
-            raise ValueError(f"{task}: there is nothing to probe of {robot}, only of {known}")
     width = model.max_action_dim
+    for task in tasks:
+        robot, actions = wpt_envs.TASKS[task].embodiment, wpt_envs.TASKS[task].action_dim
+        if robot not in QUANTITIES:
+            known = ", ".join(QUANTITIES)
+            raise ValueError(f"{task}: the robot {robot} has no quantities to probe, only {known}")
+        if actions > width:
+            raise ValueError(
+                f"{task} has {actions} actions, the model takes at most {width}: use other --tasks "
+                "(and their --suite), or a model that was pre-trained for as many"
+            )
     untrained = WPT(
         "WPTPolicy", size=model.policy.size, max_action_dim=width, seed=0, device=model.device
     )

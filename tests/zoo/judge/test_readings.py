@@ -45,6 +45,14 @@ def test_the_last_value_up_to_an_update_counts_and_rows_of_a_step_belong_togethe
     assert last_logged(folder / "none.csv", ENTROPY, 600) is None
 
 
+def test_a_damaged_log_is_named(folder):
+    path = folder / "progress.csv"
+    for text in (PROGRESS.replace("2.5", "2.?"), "100,0\n200,1\n"):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"progress.csv is damaged"):
+            last_logged(path, ENTROPY, 600)
+
+
 def test_the_narrowest_entropy_is_that_of_a_normal_with_a_tenth():
     # 4 actions of ln(0.1 sqrt(2 pi e)) each; 10 standard deviations from the bounds
     expected = 4 * math.log(0.1 * math.sqrt(2 * math.pi * math.e))
@@ -61,7 +69,7 @@ def test_readings_are_those_that_the_folder_allows(folder):
     assert rows == {
         "error of the reward head on a new episode, update 590": ("1.50", "earned -1.00 per step"),
         "entropy of the actor in nats, update 250": (
-            *("2.50", "-3.53 with the smallest standard deviations"),
+            *("2.50", "-3.53 with means of 0 and the smallest deviations"),
         ),
         "imagined reward of the same actions, largest difference": ("25 %", "of the earned reward"),
         # returns 4 and 5 are no successes, 10 and 20 are

@@ -1,4 +1,4 @@
-"""What to look at before a run is worth repeating: numbers of its log, its imagination, its clone.
+"""Readings of a finished run: numbers of its log, of its imagination and of its prior actor.
 
 `progress.csv` has rows for episodes and for evaluations. Both can belong to the same step, and each
 row has only the columns that were logged since the last one.
@@ -15,6 +15,7 @@ from rich.table import Table
 
 from wpt_agents.model.actor_critic import Actor
 from wpt_agents.zoo.judge.diagnosis import Promise
+from wpt_agents.zoo.learning_curves import damaged
 from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.result import PRIOR_ACTOR, read_result
 from wpt_agents.zoo.terminal import console
@@ -56,7 +57,7 @@ def readings(
         rows.append(Reading(what, f"{error.value:.2f}", earned))
     if entropy := last_logged(folder / "progress.csv", ENTROPY, update):
         what = f"entropy of the actor in nats, update {entropy.updates:,}"
-        floor = f"{narrowest_entropy(actions):.2f} with the smallest standard deviations"
+        floor = f"{narrowest_entropy(actions):.2f} with means of 0 and the smallest deviations"
         rows.append(Reading(what, f"{entropy.value:.2f}", floor))
     what = "imagined reward of the same actions, largest difference"
     rows.append(
@@ -71,19 +72,29 @@ def readings(
 
 
 def last_logged(path: Path, column: str, update: int) -> Logged | None:
-    """Return the last value of a column of `progress.csv` up to an update, None without one."""
+    """Return the last value of a column of `progress.csv` up to an update, None without one.
+
+    :raises ValueError: if the file is damaged
+    """
     if not path.exists():
         return None
+    try:
+        known = _logged(path, column)
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise damaged(path, error) from None
+    return next((one for one in reversed(known) if one.updates <= update), None)
+
+
+def _logged(path: Path, column: str) -> list[Logged]:
     steps: dict[str, dict[str, str]] = defaultdict(dict)
     with open(path, newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             steps[row[STEP]] |= {name: text for name, text in row.items() if text}
-    known = [
+    return [
         Logged(float(row[column]), int(float(row[UPDATES])))
         for row in steps.values()
         if column in row and UPDATES in row
     ]
-    return next((one for one in reversed(known) if one.updates <= update), None)
 
 
 def narrowest_entropy(actions: int) -> float:

@@ -47,10 +47,13 @@ def main() -> None:
     }
     try:
         run[arguments.pop("command")](**arguments)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         if (error.name or "").startswith("wpt_envs"):
             raise  # a fault of ours, not a missing package
-        parser.exit(2, f'Error: {error.name} is not installed: pip install "wpt-agents[sims]"\n')
+        if isinstance(error, ModuleNotFoundError) and error.name:
+            remedy = 'pip install "wpt-agents[sims]"'
+            parser.exit(2, f"Error: {error.name} is not installed: {remedy}\n")
+        parser.exit(2, f"Error: {error}\n")  # for example of a library of OpenGL
     except (RenderingError, OSError) as error:  # no traceback, as in the zoo
         parser.exit(2, f"Error: {error}\n")
 

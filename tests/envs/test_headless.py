@@ -125,6 +125,7 @@ def draw_montage(monkeypatch, fault):
             ModuleNotFoundError("No module named 'dm_control'", name="dm_control"),
             'dm_control is not installed: pip install "wpt-agents[sims]"',
         ),
+        (ImportError("Unable to load EGL library"), "Unable to load EGL library"),
     ],
 )
 def test_the_command_line_says_in_one_sentence_what_is_missing(

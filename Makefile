@@ -1,9 +1,9 @@
 # Three commands on a bare machine (Python 3.12 or 3.11, git, a shell):
 #   make demo       installs, then fine-tunes the shipped world model on one task in minutes
-#   make test       installs, then runs the tests
+#   make test       installs, then runs the tests on up to eight cores
 #   make learn      the test that learns from scratch, three seeds of some minutes each
 # For contributors:
-#   make check      lint, types and the fast tests, on all cores
+#   make check      lint, types and the fast tests, on up to eight cores
 #   make format     formats the code and applies automatic fixes
 #   make lint       ruff, codespell and mypy
 #   make types      mypy alone

@@ -148,7 +148,7 @@ def pretrain_model(
     share: Annotated[
         Path | None,
         typer.Option(
-            help="A file to write encoder, dynamics and decoder to in the end, in bfloat16, which "
+            help="A file for encoder, dynamics and decoder in bfloat16, written at the end, which "
             "`WPT.load` reads like the models that come with the library."
         ),
     ] = None,

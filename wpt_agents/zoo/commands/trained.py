@@ -95,14 +95,15 @@ def diagnose_model(
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
     update: Annotated[
         int,
-        typer.Option(min=0, help="The update of fine-tuning whose logged values are shown."),
+        typer.Option(min=0, help="Show the last values that were logged up to this update."),
     ] = 600,
     device: Device = "auto",
 ) -> None:
     """Compare the rewards and values that a model predicts with the rewards that it then earns.
 
-    Of a run folder, a second table has the last values of reward error and entropy that were logged
-    up to --update, the largest difference between imagined and earned reward, and the prior actor.
+    For a run folder, a second table has the last values of reward error and entropy that were
+    logged up to --update, the largest difference between imagined and earned reward, and the score
+    of the prior actor.
 
     Example: `python -m wpt_agents.zoo diagnose runs/demo/wpt/metaworld-drawer-close_0`
     """

@@ -164,6 +164,11 @@ def test_groups_of_tasks_of_two_suites_are_added_up_each():
     }
 
 
+def test_equal_tasks_differ_by_zero_despite_rounding_errors():
+    pair = pairs.Pair("dmc", "wpt", "scratch", ((0.3, 0.1 + 0.2),))
+    assert pair.cells[6:] == ["0", "1", "0", "0.00 (-)", "0.00", "1"]
+
+
 KEPT = ("", 70.0), (", last", 7.0)  # the best policy and the last one of a run
 
 

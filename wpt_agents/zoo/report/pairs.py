@@ -38,7 +38,7 @@ class Pair:
     @property
     def differences(self) -> list[float]:
         """The first policy's score minus the second's, in points, for each task."""
-        return [ours - theirs for ours, theirs in self.scores]
+        return [round(ours - theirs, 6) + 0.0 for ours, theirs in self.scores]  # no "-0.00"
 
     @property
     def above(self) -> int:

@@ -1,6 +1,7 @@
 """The learning curves beside a record."""
 
 import shutil
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -105,7 +106,14 @@ def test_runs_without_evaluations_leave_no_file_and_damaged_curves_are_named(tmp
         record_curves.read(path)
 
 
-def test_the_picture_is_drawn_again_without_run_folders(tmp_path):
+def test_the_picture_is_drawn_again_without_run_folders(tmp_path, monkeypatch):
+    locked = []
+
+    def lock(folder):
+        locked.append(folder)
+        return nullcontext()
+
+    monkeypatch.setattr(record_page, "locked_folder", lock)
     make_run(tmp_path / "runs", "metaworld-reach")
     path = tmp_path / "mid.csv"
     record_page.add(path, find_finished(tmp_path / "runs"))
@@ -113,3 +121,4 @@ def test_the_picture_is_drawn_again_without_run_folders(tmp_path):
     picture.unlink()
     ran = CliRunner().invoke(app, ["report", str(tmp_path / "none"), "--record", str(path)])
     assert ran.exit_code == 0 and picture.exists()
+    assert locked == [tmp_path, tmp_path]  # no other process writes meanwhile

@@ -70,7 +70,7 @@ def report(
     sequences = figures_4(find_sequences(folder))
     kept = records.read(record) if not results and record is not None and record.exists() else []
     if record is not None and kept:
-        record_page.write(record, kept)
+        record_page.renew(record)
         kept_as = f"No finished run below {folder}: {record} stays, its pages are renewed."
         console.print(kept_as, markup=False)
         if not sequences:

@@ -34,6 +34,12 @@ def update(record: Path, lines: Iterable[Line], points: Iterable[record_curves.P
         write(record, records.update(record, lines))
 
 
+def renew(record: Path) -> None:
+    """Write the pages of a record again; several processes take turns."""
+    with locked_folder(record.parent):
+        write(record, records.read(record))
+
+
 def write(record: Path, lines: Sequence[Line]) -> None:
     """Write the tables and the pictures of a record beside it."""
     with replacing(record.with_suffix(".md")) as temporary:

@@ -160,5 +160,6 @@ def markdown(lines: Sequence[Line]) -> str:
     if ", with a gap" in kinds:
         note += f' "With a gap" are the tasks {GAP}.'
     if kinds - {"", ", with a gap"}:
-        note += f' "{PRIOR_ACTOR.capitalize()} below {ROOM:.0f}" are those on which it has less.'
+        below = f"{PRIOR_ACTOR.capitalize()} below {ROOM:.0f}"
+        note += f' "{below}" are the tasks on which its score is lower.'
     return f"## Pairs\n\n{note}\n\n{markdown_table(HEADINGS, [pair.cells for pair in compared])}"

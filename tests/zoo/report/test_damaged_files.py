@@ -1,5 +1,7 @@
 """A damaged file in one run folder is named, and the report shows everything else."""
 
+import warnings
+
 import pytest
 from run_folders import make_run
 from test_figure4 import TASKS, make_sequence
@@ -64,6 +66,17 @@ def test_a_damaged_file_is_named_once(name, runs, tmp_path, monkeypatch, capsys)
     with pytest.warns(UserWarning) as warned:
         assert call(monkeypatch, "report", tmp_path) == 0
     assert len(warned) == 1 and name in str(warned[0].message)
+
+
+def test_the_command_line_prints_the_warning_without_a_line_of_code(runs, tmp_path, monkeypatch):
+    damage(runs[0] / "evaluations.npz", cut)
+    with pytest.warns(UserWarning) as warned:
+        assert call(monkeypatch, "report", tmp_path) == 0
+    [one] = warned
+    printed = warnings.formatwarning(one.message, one.category, one.filename, one.lineno)
+    assert printed == f"Warning: {one.message}\n"
+    other = warnings.formatwarning("old", DeprecationWarning, one.filename, one.lineno)
+    assert ".py:" in other and "DeprecationWarning: old" in other
 
 
 def test_a_run_with_a_damaged_result_is_among_those_that_failed(runs, tmp_path):

@@ -5,6 +5,7 @@ Imports are inside the commands so that `--help` answers at once.
 
 import sys
 import traceback
+import warnings
 from typing import Annotated
 
 import typer
@@ -35,6 +36,7 @@ Three commands to start with:
 All commands: python -m wpt_agents.zoo --help. One command: python -m wpt_agents.zoo run --help.
 """
 PROGRAM = "python -m wpt_agents.zoo"
+FORMAT = warnings.formatwarning  # Python's own, with the file and the line of code
 DEBUG = "--debug"
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C ended; typer returns it, too
 # Errors whose messages say what to do: wrong values, files, a loss that is not finite.
@@ -81,9 +83,11 @@ start.__doc__ = HELP  # what `--help` shows
 def main() -> None:
     """Run a command. Errors are printed as one sentence, with a traceback if `--debug` is set.
 
-    The exit code is 2 for errors that the user can fix, 1 for bugs, and 130 for an interruption.
+    Warnings that are meant for users are printed without the line of code. The exit code is 2 for
+    errors that the user can fix, 1 for bugs, and 130 for an interruption.
     """
     words = [word for word in sys.argv[1:] if word != DEBUG]
+    warnings.formatwarning = sentence
     try:
         code = app(words, prog_name=PROGRAM, standalone_mode=False)  # typer raises its errors
     except KeyboardInterrupt:
@@ -98,6 +102,19 @@ def main() -> None:
         again = "without --force" if "--force" in words else "from the finished stages"
         typer.echo(f"Interrupted. The same command continues {again}.", err=True)
     sys.exit(code or 0)
+
+
+def sentence(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Return what is printed for a warning: the message alone, if it is meant for users."""
+    if category is UserWarning:
+        return f"Warning: {message}\n"
+    return FORMAT(message, category, filename, lineno, line)
 
 
 def explain(error: Exception) -> tuple[str, int]:

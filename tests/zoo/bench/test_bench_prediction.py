@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+import wpt_envs
 from debug_agent import agent, noise
 from matplotlib.image import imread
 from typer.testing import CliRunner
@@ -19,6 +20,7 @@ from wpt_agents.model.world_model import squared_error
 from wpt_agents.zoo.bench import prediction as bench
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.judge import prediction
+from wpt_agents.zoo.judge.probes import QUANTITIES
 from wpt_agents.zoo.pictures import predictions as prediction_pictures
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -257,7 +259,15 @@ def test_open_loop_compares_several_models_by_name(pre_trained):
 ROBOTS = ("walker", "cartpole")
 
 
+def robot_of(task):
+    return wpt_envs.TASKS[task].embodiment
+
+
 def test_probes_of_one_robot_leave_the_others_out(monkeypatch, tmp_path):
+    def by_name(model, tasks, episodes):
+        return [{"quantity": name} for task in tasks for name in QUANTITIES[robot_of(task)]]
+
+    monkeypatch.setattr(bench, "probes", by_name)
     monkeypatch.setattr(bench, "QUICK", bench.QUICK._replace(folder=tmp_path))
     probed = list(bench.rows(quick=True, probe=True, robots=["cartpole"]))
     assert {row["model"] for row in probed} == {"untrained", "generalist", "specialist"}

@@ -250,6 +250,7 @@ def test_open_loop_compares_several_models_by_name(pre_trained):
     for wrong, message in (
         (["--beside", "other.zip"], "NAME=MODEL with a new name, not other.zip"),
         (["--beside", other, "--beside", other], "with a new name"),
+        (["--beside", other.replace("longer", "mean frame")], "with a new name"),
         (["--beside", f"wider={pre_trained / 'wider.zip'}"], "wider takes 3 instead of 2"),
     ):
         refused = CliRunner().invoke(app, [*words, *wrong])

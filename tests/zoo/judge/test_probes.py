@@ -70,7 +70,7 @@ def test_the_command_probes_a_file_beside_an_untrained_model(tmp_path, monkeypat
     monkeypatch.setattr(probes, "watch", short)
     model = agent(max_action_dim=6)
     model.save(tmp_path / "model.zip")
-    words = ["probe", tmp_path / "model.zip", "--tasks", "walker-run", "walker-stand"]
+    words = ["probe", tmp_path, "--tasks", "walker-run", "walker-stand"]  # the file's folder
     assert call(monkeypatch, *words, "--episodes", "2", "--device", "cpu") == 0
     tasks = ["wpt/dmc-walker-run-v0", "wpt/dmc-walker-stand-v0"]
     assert sorted(asked) == sorted((task, 2, 1000, "fast") for task in 2 * tasks)

@@ -29,6 +29,19 @@ Policy = Annotated[
     typer.Option(help="The policy to play: wpt for the trained agent, prior for its prior actor."),
 ]
 
+ModelArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A model file, the folder of a run or of a pre-training, or the name of a shipped "
+        "model."
+    ),
+]
+
+
+def model_file(model: str) -> str:
+    """Return what `WPT.load` takes: the file of a folder, or the argument itself."""
+    return str(Path(model, "model.zip")) if Path(model).is_dir() else model
+
 
 def evaluate_model(
     run: RunFolder,
@@ -121,9 +134,7 @@ def diagnose_model(
 
 
 def judge_predictions(
-    model: Annotated[
-        Path, typer.Argument(help="A model file, or the folder of a run or of a pre-training.")
-    ],
+    model: ModelArgument,
     data: Annotated[Path, typer.Argument(help="A dataset that the model was not trained on.")],
     episodes: Annotated[
         int,
@@ -156,18 +167,15 @@ def judge_predictions(
     """
     from wpt_agents.agents.wpt import WPT
     from wpt_agents.data.dataset import TrajectoryDataset
-    from wpt_agents.zoo.judge.prediction import judge
+    from wpt_agents.zoo.judge.prediction import RESERVED, judge
 
-    paths = {"world model": model}
+    chosen = {"world model": model}
     for words in beside or []:
-        name, equals, path = words.partition("=")
-        if not equals or not name or name in paths:
+        name, equals, other = words.partition("=")
+        if not equals or not name or name in (*chosen, *RESERVED):
             raise ValueError(f"--beside must be NAME=MODEL with a new name, not {words}")
-        paths[name] = Path(path)
-    models = {
-        name: WPT.load(path / "model.zip" if path.is_dir() else path, device=device)
-        for name, path in paths.items()
-    }
+        chosen[name] = other
+    models = {name: WPT.load(model_file(one), device=device) for name, one in chosen.items()}
     rows = judge(models, TrajectoryDataset.open(data), episodes, out)
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
@@ -175,7 +183,7 @@ def judge_predictions(
 
 
 def probe_latents(
-    model: Annotated[str, typer.Argument(help="A model file, or the name of a shipped model.")],
+    model: ModelArgument,
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006
     episodes: Annotated[
@@ -202,7 +210,7 @@ def probe_latents(
     from wpt_agents.zoo.tasks import find_tasks
 
     ids = [row.id for row in find_tasks(suite, tasks)]
-    loaded = WPT.load(model, device=device)
+    loaded = WPT.load(model_file(model), device=device)
     rows = beside_untrained(loaded, ids, episodes, seed, str(rendering))
     print_table("R² of linear probes on test episodes", list(rows))
 

@@ -25,6 +25,7 @@ SHOWN = (0, 5, 10, 20, 40)  # horizons of the strips; 0 is the last filtered ima
 
 Predict = Callable[[Batch], np.ndarray]  # (B, T) windows -> (B, T, 64, 64, 3)
 Ways = Mapping[str, Mapping[str, Predict]]  # by robot and name
+RESERVED = ("true", "copy last frame", "mean frame")  # rows beside those of the models
 Tests = Mapping[str, Sequence[Batch]]  # by robot, the windows of each trajectory
 
 
@@ -36,11 +37,12 @@ def judge(
 ) -> Iterator[dict[str, Any]]:
     """Compare world models with copying the last frame and with the mean frame, for each robot.
 
-    :param models: world models by name; of one `max_action_dim`
+    :param models: world models of one `max_action_dim`, by names that are not `RESERVED`
     :param dataset: held-out data, whose mean frame is one of the baselines
     :param episodes: maximum number for each robot, evenly spaced over those that are long enough
     :param folder: the folder of the pictures
-    :raises ValueError: if no trajectory is long enough, or has too many actions for a model
+    :raises ValueError: if no trajectory is long enough, if one has too many actions, or if the
+        models differ in `max_action_dim`
     """
     check_images(dataset)
     width = next(iter(models.values())).max_action_dim

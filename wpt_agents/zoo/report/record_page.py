@@ -60,7 +60,7 @@ def write(record: Path, lines: Sequence[Line]) -> None:
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """Return an introduction, the evidence of each suite, pairs, every run, and means over tasks."""
+    """Return an introduction, the tables of each suite, the pairs, every run, and the means."""
     parts = (
         *(INTRODUCTION, evidence.markdown(lines), pairs.markdown(lines)),
         record_tables.markdown(lines),

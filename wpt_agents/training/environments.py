@@ -212,7 +212,7 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
     if images:
         others = ", ".join(repr(key) for key in space.spaces if key != images[0])
         warnings.warn(
-            f"Of the Dict observations the agent sees only {images[0]!r}"
+            f"Of the Dict observations the agent sees {images[0]!r}"
             + f", not {others}" * bool(others),
             stacklevel=4,
         )

@@ -141,8 +141,9 @@ def test_every_logged_value_is_explained_and_no_other(monkeypatch):
     agent(toy_env.DotEnv()).learn(75, log_interval=1)
     page = PAGES["when-it-does-not-learn.md"]
     explained = set(re.findall(r"`((?:train|rollout|time)/\w+)`", page))
-    # a dot reports no success, its episodes do not terminate, and the others are off by default
-    unseen = {"rollout/success_rate", "train/continue_loss"}
+    # A dot reports no success, its episodes are short and do not terminate, and the others are off
+    # by default.
+    unseen = {"rollout/success_rate", "rollout/reward_per_step", "train/continue_loss"}
     unseen |= {"train/kickstart_loss", "train/reward_disagreement"}
     assert explained == seen | unseen
 

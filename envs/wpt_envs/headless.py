@@ -83,7 +83,7 @@ def choose() -> None:
 def _check_name(asked: str) -> None:
     if asked in _NONE:
         raise RenderingError(
-            f"MUJOCO_GL={asked} forbids to draw, which this package needs: unset MUJOCO_GL, or "
+            f"MUJOCO_GL={asked} forbids drawing, which this package needs: unset MUJOCO_GL, or "
             "set MUJOCO_GL=egl"
         )
     valid = (*_OFF_SCREEN, *_WINDOW)

@@ -143,7 +143,7 @@ def test_the_model_file_holds_no_pickle_and_other_classes_refuse_it(tmp_path):
 
     agent(ClockEnv()).save(tmp_path / "model.zip")
     assert b"pickle" not in (tmp_path / "model.zip").read_bytes()
-    with pytest.raises(ValueError, match=r"is of DrQv2: read it by DrQv2.load"):
+    with pytest.raises(ValueError, match=r"is of DrQv2: read it with DrQv2.load"):
         WPT.load(tmp_path / "model.zip")
 
 

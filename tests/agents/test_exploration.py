@@ -246,7 +246,7 @@ def test_exploring_never_goes_on_with_an_episode_that_learn_left():
 def test_an_explorers_file_is_read_by_its_own_class(tmp_path):
     explorer(ICMExplorer).save(tmp_path / "curious.zip")
     for other in (WPT, Plan2Explore):
-        with pytest.raises(ValueError, match=r"is of ICMExplorer: read it by ICMExplorer\.load"):
+        with pytest.raises(ValueError, match=r"is of ICMExplorer: read it with ICMExplorer\.load"):
             other.load(tmp_path / "curious.zip")
 
 

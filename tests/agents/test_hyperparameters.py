@@ -48,7 +48,7 @@ def test_a_discount_that_is_written_takes_effect_and_is_saved(tmp_path):
         ("train_freq", "nonsense", "No train_freq 'nonsense'"),
         ("guidance", "linear(1)", r"guidance='linear\(1\)' is not understood"),
         ("size", "tiny", "size='tiny' can no longer take effect: the networks are made; make a"),
-        ("batch_length", 50, "give batch_length=9 or less"),
+        ("batch_length", 50, "pass batch_length=9 or less"),
     ],
 )
 def test_a_value_that_is_refused_says_why_and_changes_nothing(data, name, value, message):

@@ -161,7 +161,7 @@ def test_learning_goes_on_without_replay_and_keeps_what_was_retrieved(learnt, st
 
 def test_learning_on_without_the_dataset_says_that_rehearsal_ends(learnt, tmp_path):
     learnt.save(tmp_path / "model")
-    with pytest.warns(UserWarning, match="rehearses no more: load it with dataset="):
+    with pytest.warns(UserWarning, match="rehearses nothing: load it with dataset="):
         WPT.load(tmp_path / "model", env=ClockEnv()).learn(7)
     WPT.load(tmp_path / "model", env=ClockEnv(), offline_ratio=0).learn(7)
 

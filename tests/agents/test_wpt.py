@@ -224,7 +224,7 @@ def test_retrieval_keeps_to_the_embodiment_when_the_data_names_it(store):
 def test_a_robot_that_the_data_do_not_name_is_told_and_gets_any_of_its_width(store):
     model = pretrained(store, env=DotEnv(), num_retrieve=9, embodiment="crab")
     with pytest.warns(
-        UserWarning, match=r"no robot of the name 'crab' \(it has dot, wide\).*of 2 actions"
+        UserWarning, match=r"no robot named 'crab' \(it has dot, wide\).*with 2 actions"
     ):
         model.learn(1)
     assert sorted(model.retrieved_ids) == [0, 1, 2, 3]

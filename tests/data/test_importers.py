@@ -83,7 +83,7 @@ def test_actions_are_rescaled_by_hand():
 
 
 def test_actions_without_limits_are_refused():
-    with pytest.raises(ValueError, match="not finite; give low and high"):
+    with pytest.raises(ValueError, match="not finite; pass low and high"):
         rescaled(np.zeros((3, 1)), [-np.inf], [np.inf])
     with pytest.raises(ValueError, match="not continuous actions"):
         rescaled(np.zeros(3), [0.0], [1.0])
@@ -110,7 +110,7 @@ def test_a_missing_package_is_asked_for_by_name():
 def test_a_format_that_is_not_known_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"No format 'gif'\. There are: hdf5, lerobot"):
         open_episodes(tmp_path, "gif")
-    with pytest.raises(ValueError, match="is empty; give a folder with data"):
+    with pytest.raises(ValueError, match="is empty; pass a folder with data"):
         open_episodes(tmp_path)
 
 
@@ -625,7 +625,7 @@ def test_minari_episodes_come_back_as_they_were(tmp_path, monkeypatch, nested, f
 @pytest.mark.filterwarnings("ignore::UserWarning:minari")
 def test_a_minari_image_key_that_is_missing_or_not_there_is_named(tmp_path, monkeypatch):
     record_minari(tmp_path, monkeypatch, [chain(9)], nested=True, jpeg_encoding=False)
-    with pytest.raises(ValueError, match="give image_key, one of: pixels"):
+    with pytest.raises(ValueError, match="pass image_key, one of: pixels"):
         open_episodes("chain/test-v0", "minari", **SMALL)[0]
     with pytest.raises(ValueError, match="has no 'image'; there are: pixels"):
         open_episodes("chain/test-v0", "minari", image_key="image", **SMALL)[0]
@@ -819,7 +819,7 @@ def test_an_unknown_robot_of_lerobot_has_no_name(tmp_path):
 
 def test_an_older_lerobot_version_and_a_camera_that_is_not_there_are_named(tmp_path):
     save_lerobot(tmp_path, [6], video=False)
-    with pytest.raises(ValueError, match="0 cameras for camera='back'; give one of: front"):
+    with pytest.raises(ValueError, match="0 cameras for camera='back'; pass one of: front"):
         open_episodes(tmp_path, camera="back")
     write_lerobot_meta(tmp_path, False, 10, version="v1.6")
     with pytest.raises(ValueError, match=r"version v1\.6; convert it to v2\.1"):
@@ -949,7 +949,7 @@ def test_rlds_actions_are_rescaled_from_the_limits_given(tmp_path):
 
 def test_an_rlds_image_is_chosen_if_there_are_several(tmp_path):
     save_rlds(tmp_path / "a.tfrecord", [chain(5)], cameras=("front", "wrist"))
-    with pytest.raises(ValueError, match="2 images a step; give image_key, one of: observation/fr"):
+    with pytest.raises(ValueError, match="2 images a step; pass image_key, one of: observation/fr"):
         open_episodes(tmp_path, "rlds", **SMALL)[0]
     check_same(open_episodes(tmp_path, image_key="wrist", **SMALL)[0], chain(5))
     with pytest.raises(ValueError, match="no 'world_vector' in its steps; there are: "):
@@ -958,7 +958,7 @@ def test_an_rlds_image_is_chosen_if_there_are_several(tmp_path):
 
 def test_an_rlds_image_key_that_names_numbers_is_named(tmp_path):
     save_rlds(tmp_path / "a.tfrecord", [chain(5)])
-    with pytest.raises(ValueError, match="no images under 'observation/state'; give image_key"):
+    with pytest.raises(ValueError, match="no images under 'observation/state'; pass image_key"):
         open_episodes(tmp_path, image_key="observation/state", **SMALL)[0]
 
 

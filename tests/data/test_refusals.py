@@ -66,7 +66,7 @@ def test_a_model_and_the_folder_of_a_run_are_no_data(tmp_path, member, words):
 
 def test_an_empty_folder_and_a_typing_error_are_told_apart(tmp_path):
     (tmp_path / "mt30").mkdir()
-    with pytest.raises(ValueError, match="mt30 is empty; give a folder with data"):
+    with pytest.raises(ValueError, match="mt30 is empty; pass a folder with data"):
         open_dataset(tmp_path / "mt30")
     with pytest.raises(ValueError, match=r"mt3O does not exist\. Did you mean .*mt30\?"):
         open_dataset(tmp_path / "mt3O")
@@ -96,9 +96,9 @@ def test_one_episode_in_npz_names_its_folder(tmp_path):
         ((np.zeros(3), np.zeros(2)), "A tuple of arrays is not a dataset"),
         ([np.zeros(3), np.zeros(2)], "A list of arrays is not a dataset"),
         (b"path", "type bytes is not a dataset"),
-        (3, "type int is not a dataset; give a TrajectoryDataset, a path"),
+        (3, "type int is not a dataset; pass a TrajectoryDataset, a path"),
         (iter([chain(3, size=64), 5]), "Item 1 of the list_iterator is a int"),
-        (gym.Env(), r"An environment \(Env\) is not a dataset: give it as env="),
+        (gym.Env(), r"An environment \(Env\) is not a dataset: pass it as env="),
     ],
 )
 def test_objects_of_other_kinds_are_called_by_name(data, words):

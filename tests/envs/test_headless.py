@@ -50,7 +50,7 @@ def test_a_window_needs_a_display_that_works(chosen, value, monkeypatch):
 
 @pytest.mark.parametrize("value", ["disable", "off", "0", "False", "DISABLED"])
 def test_drawing_that_is_forbidden_is_said_to_be(chosen, value):
-    with pytest.raises(RuntimeError, match=f"MUJOCO_GL={value.lower()} forbids to draw.*unset"):
+    with pytest.raises(RuntimeError, match=f"MUJOCO_GL={value.lower()} forbids drawing.*unset"):
         chosen(MUJOCO_GL=value)
 
 

@@ -145,9 +145,9 @@ class Bare:
         ([], "An empty list"),
         ([env := ClockEnv(), env], r"same environment twice.*for _ in range\(4\)"),
         ([ClockEnv(), ClockEnv(actions=3)], r"one action_space: number 0 has .* number 1"),
-        (3, "This int is no environment: give an id, a Gymnasium environment, a function"),
-        ({"env": ClockEnv()}, "This dict is no environment"),
-        (lambda: None, "This NoneType is no environment"),
+        (3, "This int is not an environment: pass an id, a Gymnasium environment, a function"),
+        ({"env": ClockEnv()}, "This dict is not an environment"),
+        (lambda: None, "This NoneType is not an environment"),
         (Bare(), "This Bare is a dm_env. Write a gymnasium.Env around it, as Shimmy"),
     ],
 )

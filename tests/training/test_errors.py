@@ -97,7 +97,7 @@ def test_an_empty_dataset_is_refused(tmp_path):
 
 
 def test_a_dataset_too_short_for_a_window_is_refused():
-    refused([recorded(length=6)], "has 7 images, .* takes 8: give batch_length=7", batch_length=8)
+    refused([recorded(length=6)], "has 7 images, .* takes 8: pass batch_length=7", batch_length=8)
 
 
 def test_a_dataset_of_other_images_is_refused(tmp_path):
@@ -118,7 +118,7 @@ def test_a_dataset_of_other_images_is_refused(tmp_path):
 
 
 def test_a_dataset_of_more_actions_is_refused():
-    refused([recorded(actions=4)], "4 actions, .*: give max_action_dim=4", max_action_dim=3)
+    refused([recorded(actions=4)], "4 actions, .*: pass max_action_dim=4", max_action_dim=3)
 
 
 def test_a_refused_dataset_leaves_the_run_folder_alone(tmp_path):

@@ -173,7 +173,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         progress = self.progress
         used = settings.needs_clone or settings.offline_ratio
         if self.dataset is None and progress.retrieved_ids and settings.offline_ratio:
-            what = "Without its dataset the model rehearses no more: load it with dataset="
+            what = "Without its dataset the model rehearses nothing: load it with dataset="
             warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=3)
         elif self.dataset is None and used and not progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=3)

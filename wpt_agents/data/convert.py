@@ -74,7 +74,7 @@ def open_dataset(data: Data) -> TrajectoryDataset:
     if isinstance(data, Episodes) or not isinstance(data, Sequence):
         return _stored(_checked(data))
     if not data:
-        raise ValueError("The dataset is an empty list; give trajectories, datasets or paths")
+        raise ValueError("The dataset is an empty list; pass trajectories, datasets or paths")
     if all(isinstance(item, Trajectory) for item in data):
         return _stored(cast(Sequence[Trajectory], data))
     refuse_object(data)
@@ -99,7 +99,7 @@ def refuse_object(data: Any) -> None:
     :raises ValueError: it is one of them
     """
     kind = type(data).__name__
-    make = "make Trajectory(image, action) of each episode and give their list"
+    make = "make Trajectory(image, action) of each episode and pass their list"
     if isinstance(data, Mapping):
         raise ValueError(f"A dictionary ({', '.join(map(str, data))}) is not a dataset; {make}")
     if isinstance(data, np.ndarray | torch.Tensor):
@@ -113,11 +113,11 @@ def refuse_object(data: Any) -> None:
         raise ValueError(f"A {kind} of arrays is not a dataset; {make}")
     if isinstance(data, gym.Env | VecEnv):
         raise ValueError(
-            f"An environment ({kind}) is not a dataset: give it as env=, and as dataset= the data"
+            f"An environment ({kind}) is not a dataset: pass it as env=, and as dataset= the data"
         )
     if isinstance(data, bytes) or not isinstance(data, Iterable):
         raise ValueError(
-            f"An object of type {kind} is not a dataset; give a TrajectoryDataset, a path, "
+            f"An object of type {kind} is not a dataset; pass a TrajectoryDataset, a path, "
             "trajectories, a replay buffer, or a list of these"
         )
 

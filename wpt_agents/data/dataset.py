@@ -145,11 +145,11 @@ class TrajectoryDataset(StoredTrajectories):
         opened = [d if isinstance(d, TrajectoryDataset) else cls.open(d) for d in datasets]
         sizes = {dataset.image_size: dataset.path for dataset in opened}
         if not opened:
-            raise ValueError("merge got no dataset; give a list of datasets or of their folders")
+            raise ValueError("merge got no dataset; pass a list of datasets or of their folders")
         if image_size is None and len(sizes) > 1:
             there = ", ".join(f"{path} has {size}" for size, path in sizes.items())
             raise ValueError(
-                f"merge needs datasets of one image size: {there}; give image_size=64 to resize all"
+                f"merge needs datasets of one image size: {there}; pass image_size=64 to resize all"
             )
         codecs = {folder.meta.codec for dataset in opened for folder in dataset._folders}
         codec = codecs.pop() if len(codecs) == 1 else "zstd"
@@ -166,7 +166,7 @@ class TrajectoryDataset(StoredTrajectories):
         :raises ValueError: no datasets, or images of different sizes
         """
         if not datasets:
-            raise ValueError("join got no dataset; give a list of datasets")
+            raise ValueError("join got no dataset; pass a list of datasets")
         if len({dataset.image_size for dataset in datasets}) != 1:
             sizes = ", ".join(f"{d.path} has {d.image_size}" for d in datasets)
             raise ValueError(
@@ -204,7 +204,7 @@ class TrajectoryDataset(StoredTrajectories):
         if trajectory.action[:, trajectory.action_dim :].any():
             raise ValueError(
                 f"Actions past action_dim={trajectory.action_dim} must be zero; "
-                f"give the true action_dim, of at most {trajectory.action.shape[1]}"
+                f"pass the true action_dim, of at most {trajectory.action.shape[1]}"
             )
         entry = self._begin().append(trajectory)  # `_begin` may replace the list of entries
         self._entries.append(entry)

@@ -56,7 +56,7 @@ def rescaled(action: np.ndarray, low: Any, high: Any) -> np.ndarray:
             "not continuous actions (T, A) with a lowest and a highest value for each of the A"
         )
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ValueError(f"the actions' limits {low} to {high} are not finite; give low and high")
+        raise ValueError(f"the actions' limits {low} to {high} are not finite; pass low and high")
     width = np.where(high > low, high - low, 1.0)
     scaled = np.where(high > low, 2 * (action - low) / width - 1, 0.0)
     return np.clip(scaled, -1, 1).astype(np.float32)

@@ -114,5 +114,5 @@ def _check_width(trajectory: Trajectory, width: int) -> None:
         raise ValueError(
             f"A trajectory of {trajectory.embodiment or 'an unnamed embodiment'} has "
             f"{trajectory.action_dim} actions, the agent takes {width}; "
-            f"give max_action_dim={trajectory.action_dim} or leave the trajectory out"
+            f"pass max_action_dim={trajectory.action_dim} or leave the trajectory out"
         )

@@ -17,7 +17,7 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ValueError(
             f"device={str(device)!r} does not work here (torch {torch.__version__} finds "
-            f"{torch.cuda.device_count()} CUDA devices): give device='auto' or 'cpu', or install a "
+            f"{torch.cuda.device_count()} CUDA devices): pass device='auto' or 'cpu', or install a "
             "torch that was built for the device"
         ) from error
 
@@ -42,12 +42,12 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
     if widest > max_action_dim:
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model at most "
-            f"max_action_dim={max_action_dim}: give max_action_dim={widest}"
+            f"max_action_dim={max_action_dim}: pass max_action_dim={widest}"
         )
     if longest < batch_length:
         raise ValueError(
             f"The longest trajectory of {dataset.path} has {longest} images, a batch window "
-            f"takes {batch_length}: give batch_length={longest} or less"
+            f"takes {batch_length}: pass batch_length={longest} or less"
         )
 
 

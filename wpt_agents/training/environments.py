@@ -83,7 +83,7 @@ def make(env: Any) -> gym.Env:
         return make(env())
     if any(base.__module__.split(".")[0] == "gym" for base in type(env).__mro__):
         return _patch_env(env)  # OpenAI Gym, by way of Shimmy
-    raise ValueError(f"This {type(env).__name__} is no environment: give {ACCEPTED}")
+    raise ValueError(f"This {type(env).__name__} is not an environment: pass {ACCEPTED}")
 
 
 def _make_id(env_id: str) -> gym.Env:
@@ -105,7 +105,7 @@ def _refuse_dm_env(env: Any) -> gym.Env:
     name = type(env).__name__
     if hasattr(env, "physics"):
         raise ValueError(
-            f"This {name} is a dm_env. Wrap it by Shimmy (pip install 'shimmy[dm-control]'): "
+            f"This {name} is a dm_env. Wrap it with Shimmy (pip install 'shimmy[dm-control]'): "
             "`env = wpt_envs.pixels(shimmy.DmControlCompatibilityV0(env, render_mode='rgb_array', "
             "render_kwargs={'height': 64, 'width': 64}))`"
         )
@@ -121,7 +121,7 @@ def _monitored(env: gym.Env, monitor: bool) -> gym.Env:
 
 def _side_by_side(envs: list[gym.Env]) -> VecEnv:
     if not envs:
-        raise ValueError(f"An empty list has no environment: give {ACCEPTED}")
+        raise ValueError(f"An empty list has no environment: pass {ACCEPTED}")
     # two places of one list must not step the same simulator
     if len({id(env.unwrapped) for env in envs}) < len(envs):
         raise ValueError(

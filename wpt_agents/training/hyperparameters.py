@@ -341,19 +341,19 @@ class Hyperparameters(Keywords):
         object.__setattr__(self, "size", plain_size(self.size))
         if self.pessimistic and self.reward_ensemble == 1:
             raise ValueError(
-                f"pessimism={self.pessimism!r} takes off what several reward heads deviate by, "
+                f"pessimism={self.pessimism!r} needs several reward heads, "
                 "but reward_ensemble=1: use reward_ensemble=3 or more, or pessimism=0"
             )
         if self.imitates and self.batch_length < FRAMES:
             raise ValueError(
-                f"kickstart looks at {FRAMES} images in a row, but batch_length="
+                f"kickstart needs {FRAMES} images in a row, but batch_length="
                 f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
             )
         head_start = self.actor_delay and self.needs_clone
         if (head_start or self.residual) and self.batch_length < FRAMES:
             name = "residual" if self.residual else "actor_delay"
             raise ValueError(
-                f"{name} imitates the prior actor, which looks at {FRAMES} images in a row, but "
+                f"{name} imitates the prior actor, which needs {FRAMES} images in a row, but "
                 f"batch_length={self.batch_length}: use batch_length={FRAMES} or more, or leave "
                 f"{name} out"
             )

@@ -69,7 +69,7 @@ def check_class(header: Mapping[str, Any], path: ModelPath, expected: str) -> No
     """
     kind = header.get("class", expected)
     if kind != expected:
-        raise ValueError(f"{path} is of {kind}: read it by {kind}.load, not {expected}.load")
+        raise ValueError(f"{path} is of {kind}: read it with {kind}.load, not {expected}.load")
 
 
 def check_same(before: Mapping[str, Any], now: Mapping[str, Any], names: tuple[str, ...]) -> None:

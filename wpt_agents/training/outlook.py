@@ -144,7 +144,7 @@ class Outlook:
         assignments = " and ".join(text for text in obstacles.values() if text)
         setting = f", or set {assignments} before it" if all(obstacles.values()) else ""
         return (
-            f"learn({self.steps}) {verb}: {'; '.join(obstacles)}. Let it last at least "
+            f"learn({self.steps}) {verb}: {'; '.join(obstacles)}. Pass at least "
             f"{self.needed(over)} steps{setting}"
         )
 
@@ -154,6 +154,6 @@ class Outlook:
             return None
         return (
             f"learn({self.steps}) collects nothing but {self.driver}: warmup_steps="
-            f"{self.warmup_steps}. Let it last more than {self.warmup_steps - self.start} steps, "
+            f"{self.warmup_steps}. Pass more than {self.warmup_steps - self.start} steps, "
             "or set model.warmup_steps = 0 before it"
         )

@@ -26,8 +26,8 @@ def retrieve_ids(
 ) -> list[int]:
     """Return the numbers of the R trajectories that begin most like the task.
 
-    Only trajectories with as many actions as the task are found, and if the dataset names the
-    task's robot, only those of this robot or of none.
+    Only trajectories with as many actions as the task are retrieved, and if the dataset names the
+    task's robot, only those of this robot or without a name.
 
     :param query: (Q, E), e(o) of the first images of Q episodes of the task
     :param width: the number of actions
@@ -39,8 +39,8 @@ def retrieve_ids(
     if settings.embodiment is not None and known is None and names != {None}:
         others = ", ".join(sorted(name for name in names if name))
         warnings.warn(
-            f"The dataset has no robot of the name {settings.embodiment!r} (it has {others}): "
-            f"trajectories of any robot of {width} actions are retrieved, rehearsed and cloned",
+            f"The dataset has no robot named {settings.embodiment!r} (it has {others}): "
+            f"trajectories of any robot with {width} actions are retrieved, rehearsed and cloned",
             stacklevel=4,
         )
     number = settings.value("num_retrieve")

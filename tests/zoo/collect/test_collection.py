@@ -260,7 +260,7 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"episodes": 0}, "at least 1 episode"),
         ({"behaviour": "noize"}, "Did you mean 'noise'"),
         ({"behaviour": "policy"}, "which needs it"),
-        ({"policy": "a.zip"}, "is for the behaviour 'policy'"),
+        ({"policy": "a.zip"}, "belongs to the behaviour 'policy'"),
         ({"behaviour": "policy", "policy": "no.zip"}, r"No policy no\.zip"),
         ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),
@@ -324,7 +324,7 @@ def test_a_policy_of_sb3_that_takes_states_is_shown_states_and_rescaled(tmp_path
     act = SavedPolicy(np.random.default_rng(0), name, 0.0, 2)
     expected = model.predict(np.ones(5, np.float32), deterministic=True)[0] / 3
     np.testing.assert_allclose(act(None, {"state": np.ones(5)}, 0), expected, atol=1e-6)
-    with pytest.raises(ValueError, match="the task takes 6 actions; give a policy of this robot"):
+    with pytest.raises(ValueError, match="the task takes 6 actions; pass a policy of this robot"):
         SavedPolicy(np.random.default_rng(0), name, 0.0, 6)
 
 

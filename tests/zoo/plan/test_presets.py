@@ -347,10 +347,10 @@ def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_p
         (
             "wpt",
             ["plus.kickstart=5"],
-            "plus is of --method wpt+ and scratch; write --set kickstart",
+            "plus is only used by --method wpt+ and scratch; write --set kickstart",
         ),
-        ("drq-v2", ["plus.kickstart=5"], "plus is of --method wpt+ and scratch; leave it out"),
-        ("wpt", ["sac.gamma=0.5"], "the section sac is not of --method wpt"),
+        ("drq-v2", ["plus.kickstart=5"], "only used by --method wpt+ and scratch; leave it out"),
+        ("wpt", ["sac.gamma=0.5"], "the section sac is not used by --method wpt"),
         ("wpt", ["evaluate.keep_best=true"], "no evaluations are made"),
         ("wpt", ["evaluate.during_episodes=2"], "add --set evaluate.every=FRAMES"),
     ],

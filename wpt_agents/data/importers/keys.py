@@ -130,7 +130,7 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
     pictures = [name for name, array in table.items() if is_images(array)]
     pictures = [name for name in pictures if not name.startswith("next_")]
     there = f"there are images in: {', '.join(pictures)}" if pictures else "there are no images"
-    ask = f"{there}; give image_key (--image-key)" if pictures else f"{there}; render the states"
+    ask = f"{there}; pass image_key (--image-key)" if pictures else f"{there}; render the states"
     if image_key is not None:
         name = match(image_key, table)
         if name is None:

@@ -71,7 +71,7 @@ class LeRobotEpisodes(Episodes):
             chosen = [name for name in cameras if name.endswith(f".{camera}")]
         if len(chosen) != 1:
             raise ValueError(
-                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; give one of: "
+                f"{self._folder} has {len(chosen)} cameras for camera={camera!r}; pass one of: "
                 f"{', '.join(cameras) or 'none, it has no images'}"
             )
         return chosen[0]

@@ -91,7 +91,7 @@ class MinariEpisodes(Episodes):
             tree = tree[part]
         if isinstance(tree, dict):
             raise ValueError(
-                f"{self._name} has several arrays; give {option}, one of: {', '.join(tree)}"
+                f"{self._name} has several arrays; pass {option}, one of: {', '.join(tree)}"
             )
         return np.asarray(tree)
 

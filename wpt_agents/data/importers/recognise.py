@@ -162,7 +162,7 @@ def _folder(path: Path, formats: str) -> str:
             "use dataset= for data, and WPT.load for the model file"
         )
     if not names:
-        return f"is empty; give a folder with data ({formats})"
+        return f"is empty; pass a folder with data ({formats})"
     if next(path.rglob("*.pt"), None):
         return (
             "is not a dataset: it holds .pt files of torch; if they are TD-MPC2's data with "

@@ -130,7 +130,7 @@ class RldsEpisodes(Episodes):
         pictures = sorted(
             k for k, v in steps.items() if isinstance(v, list) and v and _is_picture(v[0])
         )
-        ask = f"give image_key, one of: {', '.join(pictures) or 'none, it has no images'}"
+        ask = f"pass image_key, one of: {', '.join(pictures) or 'none, it has no images'}"
         key = self.image_key
         if key is not None and "/" not in key:
             key = f"observation/{key}"

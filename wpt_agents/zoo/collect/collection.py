@@ -215,7 +215,7 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
         raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
     if (behaviour == "policy") != (policy is not None):
         raise ValueError(
-            "policy=FILE (--policy FILE) is for the behaviour 'policy', which needs it."
+            "policy=FILE (--policy FILE) belongs to the behaviour 'policy', which needs it."
         )
     if policy is not None:
         load_policy(policy)  # raises an error if the policy is invalid

@@ -61,7 +61,7 @@ class SavedPolicy:
         self.state: tuple[np.ndarray, ...] | None = None
         if self.model.action_space.shape != (width,):
             raise ValueError(
-                f"{name} acts in {self.model.action_space}, the task takes {width} actions; give a "
+                f"{name} acts in {self.model.action_space}, the task takes {width} actions; pass a "
                 "policy of this robot"
             )
 

@@ -80,8 +80,8 @@ Settings = Annotated[
 RenderingOption = Annotated[
     Rendering,
     typer.Option(
-        help="The quality of the images: exact, as the simulator's; near; or fast, without "
-        "shadows. Use the same in the task."
+        help="The quality of the images: exact, as the simulator's; near, almost as exact; or "
+        "fast, without shadows. Use the same when you learn the task."
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="The seed of the episodes.")]

@@ -18,7 +18,7 @@ def import_model(
     ] = False,
     stoch: Annotated[
         int | None,
-        typer.Option(help="The number of groups of z, if it is not the authors' 32."),
+        typer.Option(help="The number of groups of the stochastic state, if it is not 32."),
     ] = None,
 ) -> None:
     """Convert a model file of the paper's authors into a model file of WPT.

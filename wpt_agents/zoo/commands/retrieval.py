@@ -21,14 +21,18 @@ Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
     model: Annotated[
-        Path, typer.Option(help="The model, a file or a name, whose encoder compares the images.")
+        Path,
+        typer.Option(
+            help="A model file, or the name of a shipped model, whose encoder compares the images."
+        ),
     ],
     query: Annotated[
-        list[int], typer.Option(help="Numbers of trajectories whose first images to search for.")
+        list[int],
+        typer.Option(help="Numbers of trajectories whose first images are the queries."),
     ] = [],  # noqa: B006
     task: Annotated[
         list[str],
-        typer.Option(help="Tasks whose first images to search for."),
+        typer.Option(help="Tasks whose first images are the queries."),
     ] = [],  # noqa: B006
     suite: Suite = "dmc",
     rendering: Annotated[
@@ -47,7 +51,7 @@ def show_retrieval(
 ) -> None:
     """Draw first images beside the trajectories that start most like them, with distances.
 
-    Without --query and --task, the first images of some trajectories of the dataset are used.
+    Without --query and --task, the first images of some trajectories are the queries.
 
     Example: `python -m wpt_agents.zoo retrieve show data/two --model m.zip --task walker-run`
     """
@@ -71,9 +75,12 @@ def show_retrieval(
 def share_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset that names its tasks.")],
     model: Annotated[
-        str, typer.Option(help="The model, a file or a name, whose encoder compares the images.")
+        str,
+        typer.Option(
+            help="A model file, or the name of a shipped model, whose encoder compares the images."
+        ),
     ],
-    task: Annotated[list[str], typer.Option(help="Tasks whose first images to search for.")],
+    task: Annotated[list[str], typer.Option(help="Tasks whose first images are the queries.")],
     suite: Suite = "metaworld",
     rendering: Annotated[
         Rendering, typer.Option(help="The quality of the images of the tasks.")

@@ -10,7 +10,7 @@ from wpt_agents.zoo.commands.options import Device, Settings, Suite, Tasks, Work
 PresetName = Annotated[
     str,
     typer.Option(
-        help="The settings, by size: debug, demo, tiny, mid, small, medium or paper (zoo/*.yaml)."
+        help="A named set of settings: debug, demo, tiny, mid, small, medium or paper (zoo/*.yaml)."
     ),
 ]
 Out = Annotated[

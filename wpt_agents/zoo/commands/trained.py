@@ -140,7 +140,7 @@ def judge_predictions(
         int,
         typer.Option(
             min=1,
-            help="The number of episodes of each robot at most, evenly spaced in the dataset.",
+            help="The largest number of episodes of each robot, evenly spaced in the dataset.",
         ),
     ] = 8,
     out: Annotated[

@@ -52,12 +52,12 @@ def why_useless(
     section, _, keyword = change.key.rpartition(".")
     chosen = [METHODS[name] for name in methods]
     if section in AGENTS and not any(section in sections(one.agent) for one in chosen):
-        return f"the section {section} is not of --method {' '.join(methods)}; leave it out"
+        return f"the section {section} is not used by --method {' '.join(methods)}; leave it out"
     if section == "plus" and not any(one.plus for one in chosen):
         with_plus = " and ".join(name for name, one in METHODS.items() if one.plus)
         of_wpt = all(one.agent is WPT and keyword not in one.keywords for one in chosen)
         instead = f"write --set {keyword}={change.value}" if of_wpt else "leave it out"
-        return f"the section plus is of --method {with_plus}; {instead}"
+        return f"the section plus is only used by --method {with_plus}; {instead}"
     if section == "collect" and data is not None:
         return f"--data {data} takes the place of the preset's data; leave one of them out"
     if section == "pretrain" and keyword != "model" and only_shipped(preset, methods):

@@ -160,7 +160,7 @@ METHODS = {
     "explore": Method(RLPD, {"label": "optimistic"}, **MODEL_FREE),
     # An upper bound for the previous two: needs --data with rewards (`collect --rewards`).
     "rlpd": Method(RLPD, {"label": "true"}, **MODEL_FREE),
-    # More recent than the paper: the strongest model-free method that is feasible on a CPU.
+    # Not in the paper: the strongest model-free method that is feasible on a CPU.
     "mrq": Method(MRQ, **MODEL_FREE, needs_data=False),
     # SB3's own algorithm: the alternative without this library.
     "sac": Method(SAC, **MODEL_FREE, needs_data=False, wrap=stacked),

@@ -123,7 +123,7 @@ def markdown(lines: Sequence[Line]) -> str:
     shown = {task for one in suites for task in one.tasks}
     if changed := sorted({line.task for line in lines if line.frames} - shown):
         parts.append(
-            "Tasks that were only run with changed settings or another preset are under "
+            "Tasks that were only run with changed settings or another preset are listed under "
             f"[every run](#every-run) alone: {', '.join(changed)}.\n"
         )
     return "\n".join(parts)
@@ -133,24 +133,25 @@ def explanation(one: Evidence) -> str:
     """Return the explanation of a table's columns and its last row."""
     unit = UNITS.get(one.suite, " or ".join(UNITS.values()))
     text = (
-        f"A score is {unit}, averaged over seeds; their number is in brackets where there are "
-        f"several. A method's column is its last policy after {one.frames:,} frames with the "
-        f"unchanged preset `{one.preset}`; the paper's columns are at {PAPER_BUDGET:,} frames. "
+        f"A score is {unit}, averaged over seeds; if there are several, their number is in "
+        f"brackets. The column of a method shows its last policy after {one.frames:,} frames with "
+        f"the unchanged preset `{one.preset}`. The paper's columns are at {PAPER_BUDGET:,} frames. "
     )
     if any(f"{name}, last" in one.scores for name in one.scores):
         text += (
-            "But where there is a column `METHOD, last`, the column `METHOD` is the policy that "
-            "did best in evaluations during training. "
+            "If there is a column `METHOD, last`, that is the last policy, and the column `METHOD` "
+            "shows the policy that did best in evaluations during training. "
         )
     text += (
-        "The row of means averages every column over the tasks with a score, and shows in brackets "
-        "their number and, from three tasks on, the 95 % interval by a bootstrap over tasks"
+        'The row "mean" averages each column over the tasks that have a score. In brackets are the '
+        "number of these tasks and, from three tasks on, the 95 % interval by a bootstrap over "
+        "tasks."
     )
     if one.ours is not None:
-        text += f"; in the paper's columns only tasks with a score of `{one.ours}` count"
+        text += f" In the paper's columns, only tasks with a score of `{one.ours}` count."
     if one.with_gap:
-        text += f". The last row does the same for the tasks {GAP}"
-    return f"{text}. Only means over the same tasks can be compared.\n"
+        text += f' The row "mean, with a gap" averages over the tasks {GAP}.'
+    return f"{text} Only means over the same tasks can be compared.\n"
 
 
 def table(one: Evidence) -> str:

@@ -68,12 +68,13 @@ HEADINGS = (
     *("number", "above", "equal", "below", "mean difference (95 %)", "smallest", "p, sign test"),
 )
 NOTE = (
-    "Only last policies with the unchanged preset and the usual budget are compared, on each task "
-    "by the mean over the seeds that both have; the paper gives means alone. The prior actor is "
-    "the one in the record, which another method may have cloned. Every task counts the same. An "
-    "interval, by a bootstrap over three tasks or more, says how much other tasks would change the "
-    'mean, not other seeds. "Smallest" is the difference on the task where it is smallest. The '
-    "sign test leaves out equal tasks."
+    "This table compares two policies over the tasks that both have. Only last policies with the "
+    "unchanged preset and the usual budget are compared. The score of a task is the mean over the "
+    "seeds that both policies have, or the paper's published mean. The prior actor is the one in "
+    "the record, which another method may have cloned. All tasks have the same weight. The "
+    "intervals are bootstraps over tasks, from three tasks on: they show how much other tasks "
+    'would change a mean, not how much other seeds would. "Smallest" is the smallest difference on '
+    "a task. The sign test leaves out tasks with equal scores."
 )
 
 

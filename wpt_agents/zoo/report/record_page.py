@@ -10,6 +10,17 @@ from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.record import Line
 from wpt_agents.zoo.run.locks import locked_folder
 
+INTRODUCTION = """\
+# Recorded scores
+
+This page shows the scores in the CSV file of the same name, a record of runs that
+`python -m wpt_agents.zoo run` and `report` keep with the option `--record`. A policy has the name
+of its method. `nothing` does nothing, `random` acts uniformly at random, and `prior actor` is the
+behaviour clone with which WPT begins; `prior actor, METHOD` is the clone of another method. If runs
+kept the policy that did best in evaluations, this is `METHOD`, and `METHOD, last` is the last one.
+`METHOD, after head start` is the policy after the first `actor_delay` updates.
+"""
+
 
 def check(record: Path) -> None:
     """Raise an error if a path cannot be a record, or if its files are damaged."""
@@ -49,6 +60,9 @@ def write(record: Path, lines: Sequence[Line]) -> None:
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """Return the evidence of each suite, the pairs, every run, and the means over tasks."""
-    parts = (evidence.markdown(lines), pairs.markdown(lines), record_tables.markdown(lines))
+    """Return an introduction, the tables of each suite, the pairs, every run, and the means."""
+    parts = (
+        *(INTRODUCTION, evidence.markdown(lines), pairs.markdown(lines)),
+        record_tables.markdown(lines),
+    )
     return "\n".join(part for part in parts if part)

@@ -141,8 +141,8 @@ TASK_NOTE = (
     "three seeds on; an end marked * is cut off at the limit of a success rate."
 )
 SUITE_NOTE = (
-    "In brackets is the 95 % interval by a bootstrap of the seeds within each task, of which every "
-    "task needs two and a single task three."
+    "In brackets is the 95 % interval by a bootstrap over the seeds within each task. It needs two "
+    "seeds of every task, or three if there is a single task."
 )
 
 

@@ -418,6 +418,16 @@ def test_without_a_prior_actor_the_warm_up_is_uniform_and_the_actor_takes_over()
     assert not (warm == acted).any()
 
 
+def test_no_warm_up_repeats_the_random_actions_of_an_earlier_one():
+    model = agent(DotEnv(), train_ratio=0).learn(LENGTH)
+    model.learn(LENGTH)  # counts its steps from 0 again
+    first, second = (t.action for t in model.replay_buffer.trajectories)
+    model.next_task(DotEnv())
+    third = model.learn(LENGTH).replay_buffer.trajectories[0].action
+    assert not (first == second).any() and not (first == third).any()
+    assert not (second == third).any()
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("terminates", [True, False])
 def test_episodes_are_stored_as_they_were(n_envs, terminates):

@@ -348,7 +348,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         checked = self._checked(env)
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)
-        self.num_timesteps = 0
+        self.progress.restart_steps()
         self._use_env(checked)
 
     def too_late(self, stage: Stage) -> str | None:

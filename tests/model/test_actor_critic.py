@@ -483,6 +483,12 @@ def test_the_replay_value_loss_teaches_the_critic_alone(scale):
         assert all(map(torch.equal, *weights))
 
 
+def test_the_replay_value_loss_takes_sequences_of_one_image():
+    model, metrics = filled(repval_scale=0.3, batch_length=1), defaultdict(list)
+    model.update(metrics)
+    assert metrics["train/replay_value_loss"][0].isfinite()
+
+
 def test_the_replay_value_loss_is_that_of_the_replayed_rewards():
     model = filled(repval_scale=0.3, gamma=0.5, lam=1.0)
     batch = mix(model.replay_buffer, None, 0, 2, 4, model.max_action_dim, np.random.default_rng(0))

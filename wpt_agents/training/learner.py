@@ -159,7 +159,7 @@ class Learner(WorldModelLearner):
             with torch.no_grad():
                 value = self.policy.target_critic.value(post.feat)
             ends = batch.is_first[:, 1:]
-            is_last = torch.cat([ends, torch.zeros_like(ends[:, :1])], 1)
+            is_last = torch.cat([ends, torch.zeros_like(batch.is_first[:, :1])], 1)
             returns = replay_return(
                 batch.reward, value, is_last, batch.is_terminal, settings.gamma, settings.lam
             )

@@ -418,6 +418,15 @@ def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
     assert model.policy.return_scale.item() == pytest.approx(3.87 * 0.99**200)
 
 
+def test_a_return_scale_that_is_switched_on_later_starts_from_the_first_returns(monkeypatch):
+    model, metrics = filled(return_norm=False), defaultdict(list)
+    monkeypatch.setattr("wpt_agents.training.learner.return_range", lambda _: torch.tensor(3.0))
+    model.update(metrics)
+    model.return_norm = True
+    model.update(metrics)
+    assert [scale.item() for scale in metrics["train/return_scale"]] == [1.0, 3.0]
+
+
 # ----------------------------------------------------------------- what DreamerV3 does otherwise
 
 

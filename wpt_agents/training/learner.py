@@ -289,7 +289,7 @@ class Learner(WorldModelLearner):
         """Return the running 5-95 % range of the returns, and what they are divided by."""
         before = self.policy.return_scale
         if not self.hyperparameters.value("return_norm"):
-            return torch.ones_like(before), torch.ones_like(before)
+            return before, torch.ones_like(before)
         width = return_range(returns)
         unknown = before == 0  # these are the first returns
         spread = torch.where(unknown, width, before.lerp(width, 0.01))  # DreamerV3's rate

@@ -208,7 +208,6 @@ class Learner(WorldModelLearner):
         actor_norm = torch.zeros_like(scale)
         if terms:
             actor_norm = self.descend(self.actor_optimizer, sum(terms[1:], terms[0]), "actor")
-        policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
             bins = policy.bin_range
@@ -218,6 +217,7 @@ class Learner(WorldModelLearner):
                 slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on, bins)
                 total = total + settings.slow_critic_scale * slow
         critic_norm = self.descend(self.critic_optimizer, total, "critic")
+        policy.return_scale.copy_(spread)  # now that it is known to be finite
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
         metrics = {
             "actor_loss": loss,

@@ -520,6 +520,16 @@ def test_the_average_of_the_actors_since_the_head_start_acts(tmp_path):
         assert np.allclose(model.predict(image, deterministic=True)[0], action, atol=1e-6)
 
 
+def test_an_average_that_is_switched_off_acts_no_longer(tmp_path):
+    settings = {"learning_starts": 7, "train_ratio": 4, "actor_average": 0.25}
+    model = agent(ClockEnv(length=7), **settings).learn(14)
+    model.save(tmp_path / "model.zip")
+    loaded = WPT.load(tmp_path / "model.zip", actor_average=0.0)
+    assert model.policy.acting_actor is not model.policy.actor
+    model.actor_average = 0.0
+    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded))
+
+
 @pytest.mark.parametrize(("number", "states"), [(None, 24), (3, 3)])
 def test_dreams_start_from_as_many_states_as_the_keyword_says(number, states, monkeypatch):
     model, seen = agent(batch_size=4, batch_length=6, imagine_starts=number), []

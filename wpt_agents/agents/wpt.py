@@ -218,7 +218,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         )
         self.policy.prior_actor.load_state_dict(actor.state_dict())
         self.progress.cloned = True
-        self.let_clone_compete()
+        self.choose_who_acts()
 
     # // Collect Data: see `PixelAgent.collect`, which asks these
 

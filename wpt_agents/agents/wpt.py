@@ -267,15 +267,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             settings.recent_share,
             settings.marks,
         ).to(self.device)
-        if settings.actor_critic_decay:
-            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
         head_start = progress.task_updates < settings.actor_delay
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
         if settings.residual and progress.cloned and not head_start:
             self.begin_residual()
+        if settings.actor_critic_decay:
+            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
         self.learner.step = progress.num_timesteps
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():

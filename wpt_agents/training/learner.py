@@ -96,7 +96,7 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        imitator = self.policy.imitator
+        imitator = self.policy.imitator if self.hyperparameters.residual else None
         advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
         if advice is not None and imitation_weight and self.hyperparameters.imitation_grad:

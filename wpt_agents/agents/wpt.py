@@ -348,8 +348,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         checked = self._checked(env)
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)
+            self._use_env(checked)  # draws again where actions have another width
         self.progress.restart_steps()
-        self._use_env(checked)
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""

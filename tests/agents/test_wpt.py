@@ -418,6 +418,16 @@ def test_without_a_prior_actor_the_warm_up_is_uniform_and_the_actor_takes_over()
     assert not (warm == acted).any()
 
 
+def test_no_warm_up_repeats_the_random_actions_of_an_earlier_one():
+    model = agent(DotEnv(), train_ratio=0).learn(LENGTH)
+    model.learn(LENGTH)  # counts its steps from 0 again
+    first, second = (t.action for t in model.replay_buffer.trajectories)
+    model.next_task(DotEnv())
+    third = model.learn(LENGTH).replay_buffer.trajectories[0].action
+    assert not (first == second).any() and not (first == third).any()
+    assert not (second == third).any()
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("terminates", [True, False])
 def test_episodes_are_stored_as_they_were(n_envs, terminates):
@@ -508,6 +518,16 @@ def test_the_average_of_the_actors_since_the_head_start_acts(tmp_path):
     model.policy.average(0)
     with definitions():
         assert np.allclose(model.predict(image, deterministic=True)[0], action, atol=1e-6)
+
+
+def test_an_average_that_is_switched_off_acts_no_longer(tmp_path):
+    settings = {"learning_starts": 7, "train_ratio": 4, "actor_average": 0.25}
+    model = agent(ClockEnv(length=7), **settings).learn(14)
+    model.save(tmp_path / "model.zip")
+    loaded = WPT.load(tmp_path / "model.zip", actor_average=0.0)
+    assert model.policy.acting_actor is not model.policy.actor
+    model.actor_average = 0.0
+    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded))
 
 
 @pytest.mark.parametrize(("number", "states"), [(None, 24), (3, 3)])
@@ -718,12 +738,13 @@ def test_the_nearest_of_dataset_and_earlier_episodes_are_retrieved(store):
     assert model.retrieved_ids == [6]  # it begins exactly as the task does
 
 
-def test_another_task_of_a_sequence_is_drawn_by_the_seed_and_keeps_the_world_model(store):
+@pytest.mark.parametrize("actions", [2, 3])
+def test_another_task_of_a_sequence_is_drawn_by_the_seed_and_keeps_the_world_model(store, actions):
     models = [pretrained(store, env=DotEnv()).learn(LENGTH) for _ in range(2)]
     before = weights(models[0])
     for number, model in enumerate(models):
         torch.manual_seed(number)  # torch's own generator must not matter
-        model.next_task(DotEnv())
+        model.next_task(DotEnv(actions=actions))
     one, other = (weights(model) for model in models)
     assert same(one, other)
     assert not same(

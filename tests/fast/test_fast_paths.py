@@ -1,7 +1,9 @@
 """Faster twins together: losses and weights after whole updates are those of the definitions."""
 
 from collections import defaultdict
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from debug_agent import agent, pretrained, recorded, weights
@@ -79,6 +81,21 @@ def test_three_compiled_updates_are_those_of_the_definition(monkeypatch):
         torch.testing.assert_close(compiled[name], values, rtol=1e-4, atol=1e-5, msg=name)
     for name, weight in after.items():
         assert (weight - weights_after[name]).abs().mean() < 2e-5, name
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # at which torch looks
+def test_a_step_is_compiled_once_for_episodes_of_all_lengths():
+    model, graphs = agent(), []
+
+    def backend(graph, _):
+        graphs.append(graph)
+        return graph.forward
+
+    compile_loops(model.policy, backend)
+    for length in (3, 4, 5):  # an episode that ends early is judged like any other
+        episode = replace(recorded(length), reward=np.zeros(length, np.float32))
+        model.policy.heldout_errors(episode)
+    assert len(graphs) == 1
 
 
 def test_bfloat16_leaves_the_curve_of_pretraining_as_it_is():

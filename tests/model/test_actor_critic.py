@@ -418,6 +418,15 @@ def test_the_return_scale_is_a_running_range_not_below_one(monkeypatch):
     assert model.policy.return_scale.item() == pytest.approx(3.87 * 0.99**200)
 
 
+def test_a_return_scale_that_is_switched_on_later_starts_from_the_first_returns(monkeypatch):
+    model, metrics = filled(return_norm=False), defaultdict(list)
+    monkeypatch.setattr("wpt_agents.training.learner.return_range", lambda _: torch.tensor(3.0))
+    model.update(metrics)
+    model.return_norm = True
+    model.update(metrics)
+    assert [scale.item() for scale in metrics["train/return_scale"]] == [1.0, 3.0]
+
+
 # ----------------------------------------------------------------- what DreamerV3 does otherwise
 
 
@@ -481,6 +490,12 @@ def test_the_replay_value_loss_teaches_the_critic_alone(scale):
     for part in ("world_model", "actor"):
         weights = (getattr(item, part).parameters() for item in (without, policy))
         assert all(map(torch.equal, *weights))
+
+
+def test_the_replay_value_loss_takes_sequences_of_one_image():
+    model, metrics = filled(repval_scale=0.3, batch_length=1), defaultdict(list)
+    model.update(metrics)
+    assert metrics["train/replay_value_loss"][0].isfinite()
 
 
 def test_the_replay_value_loss_is_that_of_the_replayed_rewards():

@@ -50,6 +50,10 @@ def test_two_hot_by_hand():
     torch.testing.assert_close(weights, torch.tensor(rows).float(), atol=1e-6, rtol=0)
 
 
+def test_two_hot_of_what_is_not_finite_is_nan_and_no_error():
+    assert two_hot(torch.tensor([math.nan, 1.0]), 5).isnan().any(-1).tolist() == [True, False]
+
+
 def test_two_hot_round_trip_over_a_million_either_way():
     size = torch.logspace(-4, 6, 500)
     x = torch.cat([-size, torch.zeros(1), size])

@@ -85,6 +85,25 @@ def test_the_imitator_learns_beside_the_others_and_changes_none_of_them(data, tm
     assert not any(torch.equal(imitator[f"imitator.{k[6:]}"], w) for k, w in before.items())
 
 
+def test_the_imitator_has_the_rate_of_the_actor_from_its_first_update_on(data):
+    model = learned(data, train_ratio=1e-9, actor_critic_decay=True)
+    model.num_timesteps = 4 * LENGTH // 5
+    model.update(defaultdict(list))
+    learner, rate = model.learner, model.hyperparameters.value("actor_critic_learning_rate")
+    rates = [o.param_groups[0]["lr"] for o in (learner.actor_optimizer, learner.imitator_optimizer)]
+    assert rates == pytest.approx([rate / 5, rate / 5])
+
+
+def test_an_imitator_that_is_not_used_learns_nothing(data):
+    model = learned(data)
+    for name, value in {"residual": False, "kickstart": 0.0, "actor_delay": 0}.items():
+        setattr(model, name, value)
+    model.batch_length = 2  # too short for the clone, which sees three images
+    before = weights(model, "imitator.")
+    model.update(defaultdict(list))
+    assert before and same(before, weights(model, "imitator."))
+
+
 def test_without_a_clone_the_actor_acts(data):
     model = agent(DotEnv(), residual=True, offline_ratio=0, guidance=0)
     assert not model.policy.residual and model.hyperparameters.needs_clone

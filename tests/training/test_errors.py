@@ -239,6 +239,14 @@ def test_a_loss_that_is_nan_stops_with_finite_weights(monkeypatch, name, network
     assert finite(loaded)
 
 
+def test_returns_that_are_nan_in_the_head_start_stop_with_a_finite_scale(monkeypatch):
+    model = agent(ClockEnv(), actor_delay=100)  # in which the actor's loss does not count
+    poison(monkeypatch, "lambda_return", after=1, module=learner)
+    with pytest.raises(FloatingPointError, match=r"critic loss is nan.*lower the learning"):
+        model.learn(100)
+    assert finite(model) and model.updates == 1
+
+
 @pytest.mark.parametrize(
     ("network", "name"),
     [("world_model.encoder", "world model"), ("actor", "actor"), ("critic", "critic")],

@@ -83,7 +83,15 @@ def test_a_later_task_saves_the_end_of_its_own_head_start(tmp_path):
     saved = [(tmp_path / "first" / HEAD_START_MODEL).exists()]
     model.next_task(ClockEnv(length=7))
     model.learning_starts = 14
-    for steps in (14, 7):  # the updates are made after step 14
+    for steps in (7, 7):  # the updates are made after step 14
         model.learn(steps, callback=HeadStart(tmp_path / "second"), reset_num_timesteps=False)
         saved.append((tmp_path / "second" / HEAD_START_MODEL).exists())
     assert saved == [True, False, True]
+
+
+def test_the_end_of_the_head_start_is_saved_before_the_first_update_of_imagination(tmp_path):
+    model = agent(ClockEnv(length=7), learning_starts=14, train_ratio=4, actor_delay=3)
+    model.learn(14, callback=HeadStart(tmp_path))
+    assert model.task_updates == 7  # the head start, and at once all that were earned
+    assert WPT.load(tmp_path / HEAD_START_MODEL).task_updates == 3
+    assert "update" not in vars(model)

@@ -83,7 +83,8 @@ class PixelAgent(SavedAgent):
 
     def guide(self, frames: np.ndarray) -> np.ndarray:
         """Act in the warm-up and in guidance windows: (k, F, 64, 64, 3) -> (k, A) in [-1, 1]."""
-        rng = self.streams.numpy(Purpose.WARMUP, self.num_timesteps)
+        steps = self.progress.earlier_steps + self.num_timesteps
+        rng = self.streams.numpy(Purpose.WARMUP, steps)
         width = self.policy.action_mask.shape[0]
         actions = rng.uniform(-1, 1, (len(frames), width)) * self.policy.action_mask.cpu().numpy()
         return np.asarray(actions, np.float32)
@@ -142,6 +143,8 @@ class PixelAgent(SavedAgent):
         """Set up what `learn` needs, reset the environment, call the first and last callback."""
         if self.env is None:
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
+        if reset_num_timesteps:
+            self.progress.restart_steps()
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

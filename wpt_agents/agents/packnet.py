@@ -242,7 +242,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self.replay_buffer = ReplayBuffer()
         self.progress.reset("credit", "seen_length")
         self.progress.task += 1
-        self.num_timesteps = 0
+        self.progress.restart_steps()
         self.progress.updates_before = self.updates
         self.learner = self.make_learner()
         self._use_env(checked)

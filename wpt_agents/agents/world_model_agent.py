@@ -145,7 +145,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             kept = {name: getattr(before, name) for name in ("pretrain_steps", "initialised")}
             header = {**header, "counters": self.progress_class(**kept).as_dict()}
         super().restore(header, tensors, same)
-        self.let_clone_compete()
+        self.choose_who_acts()
 
     def _check_same(
         self,
@@ -165,10 +165,15 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         super().set_parameters(*args, **kwargs)
         self.progress.initialised = True
 
-    def let_clone_compete(self) -> None:
-        """Let the clone take part in acting (`ibrl`, `residual`) if there is one."""
+    def choose_who_acts(self) -> None:
+        """Let the clone (`ibrl`, `residual`) and the average actor act where keywords say so.
+
+        The clone must be there. An average begins with the next update and is dropped at once.
+        """
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
         self.policy.residual = self.hyperparameters.residual and self.progress.cloned
+        if not self.hyperparameters.actor_average:
+            self.policy.average(0.0)
 
     def operations(self) -> AbstractContextManager[None]:
         """Return the context that the networks compute in, by the keyword `fast`."""
@@ -236,14 +241,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         self.progress.reset("cloned", "task_updates")
         super().reset_task()
-        self.let_clone_compete()
+        self.choose_who_acts()
 
     def hyperparameters_changed(self) -> None:
         """Let the learner use the changed keywords, if they suit the dataset."""
         if self.dataset is not None:
             self.check_data(self.dataset)
         self.learner.configure(self.hyperparameters)
-        self.let_clone_compete()
+        self.choose_who_acts()
 
     # What a model can show
 

@@ -218,7 +218,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         )
         self.policy.prior_actor.load_state_dict(actor.state_dict())
         self.progress.cloned = True
-        self.let_clone_compete()
+        self.choose_who_acts()
 
     # // Collect Data: see `PixelAgent.collect`, which asks these
 
@@ -267,15 +267,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             settings.recent_share,
             settings.marks,
         ).to(self.device)
-        if settings.actor_critic_decay:
-            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
         head_start = progress.task_updates < settings.actor_delay
         imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
         if head_start and progress.cloned:
             imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
         if settings.residual and progress.cloned and not head_start:
             self.begin_residual()
+        if settings.actor_critic_decay:
+            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
         self.learner.step = progress.num_timesteps
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
@@ -348,8 +348,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         checked = self._checked(env)
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)
-        self.num_timesteps = 0
-        self._use_env(checked)
+            self._use_env(checked)  # draws again where actions have another width
+        self.progress.restart_steps()
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""

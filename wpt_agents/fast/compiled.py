@@ -73,7 +73,17 @@ def compiled_filter_step(
 ) -> tuple[Latent, Tensor]:
     """`filter_step`, compiled."""
     draw = exponential(torch.empty_like(state.stoch, dtype=torch.float32), generator)
-    return _steps[rssm](rssm, state, (action_embed, embed_half, is_first), draw)
+    inputs = dense(action_embed), dense(embed_half), dense(is_first)
+    return _steps[rssm](rssm, state, inputs, draw)
+
+
+def dense(x: Tensor) -> Tensor:
+    """Return a step's inputs with strides that do not depend on the length of their sequence.
+
+    For other strides the step would be compiled again, and after eight times not at all. Batches
+    have one length, and are not copied; single episodes have many.
+    """
+    return x.clone(memory_format=torch.contiguous_format) if len(x) == 1 else x
 
 
 def dream_is_compiled(

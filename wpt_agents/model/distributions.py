@@ -80,7 +80,8 @@ def two_hot(x: Tensor, bins: int = BINS, bin_range: float = BIN_RANGE) -> Tensor
     position = (symlog(x).clamp(-bin_range, bin_range) + bin_range) * (bins - 1) / (2 * bin_range)
     below = position.floor().clamp(max=bins - 2)
     upper = (position - below).unsqueeze(-1)
-    index = below.long().unsqueeze(-1)
+    # NaN becomes a loss that is NaN; an index out of range would end a process with a GPU
+    index = below.long().clamp_(0, bins - 2).unsqueeze(-1)
     weights = torch.zeros(*x.shape, bins, device=x.device, dtype=position.dtype)
     return weights.scatter_(-1, index, 1 - upper).scatter_(-1, index + 1, upper)
 

@@ -96,7 +96,7 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        imitator = self.policy.imitator
+        imitator = self.policy.imitator if self.hyperparameters.residual else None
         advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
         if advice is not None and imitation_weight and self.hyperparameters.imitation_grad:
@@ -159,7 +159,7 @@ class Learner(WorldModelLearner):
             with torch.no_grad():
                 value = self.policy.target_critic.value(post.feat)
             ends = batch.is_first[:, 1:]
-            is_last = torch.cat([ends, torch.zeros_like(ends[:, :1])], 1)
+            is_last = torch.cat([ends, torch.zeros_like(batch.is_first[:, :1])], 1)
             returns = replay_return(
                 batch.reward, value, is_last, batch.is_terminal, settings.gamma, settings.lam
             )
@@ -208,7 +208,6 @@ class Learner(WorldModelLearner):
         actor_norm = torch.zeros_like(scale)
         if terms:
             actor_norm = self.descend(self.actor_optimizer, sum(terms[1:], terms[0]), "actor")
-        policy.return_scale.copy_(spread)  # now that it is known to be finite
         with self.autocast():
             logits = over_steps(policy.critic, dream.states.detach().but_last())
             bins = policy.bin_range
@@ -218,6 +217,7 @@ class Learner(WorldModelLearner):
                 slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on, bins)
                 total = total + settings.slow_critic_scale * slow
         critic_norm = self.descend(self.critic_optimizer, total, "critic")
+        policy.return_scale.copy_(spread)  # now that it is known to be finite
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
         metrics = {
             "actor_loss": loss,
@@ -289,7 +289,7 @@ class Learner(WorldModelLearner):
         """Return the running 5-95 % range of the returns, and what they are divided by."""
         before = self.policy.return_scale
         if not self.hyperparameters.value("return_norm"):
-            return torch.ones_like(before), torch.ones_like(before)
+            return before, torch.ones_like(before)
         width = return_range(returns)
         unknown = before == 0  # these are the first returns
         spread = torch.where(unknown, width, before.lerp(width, 0.01))  # DreamerV3's rate

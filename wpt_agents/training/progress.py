@@ -21,6 +21,7 @@ class Progress:
     :ivar windows_drawn: episodes for which a guidance window was drawn
     :ivar seen_length: steps of the longest trajectory so far
     :ivar cut: trajectories that were stored before their episode ended
+    :ivar earlier_steps: steps before `num_timesteps` began at 0 again
     """
 
     num_timesteps: int = 0
@@ -30,6 +31,7 @@ class Progress:
     windows_drawn: int = 0
     seen_length: int | None = None
     cut: int = field(default=0, metadata={"earlier": 0})
+    earlier_steps: int = field(default=0, metadata={"earlier": 0})
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> Self:
@@ -51,6 +53,11 @@ class Progress:
     def as_dict(self) -> dict[str, Any]:
         """Return the counters by name, as model files hold them."""
         return asdict(self)
+
+    def restart_steps(self) -> None:
+        """Count the steps from 0 again; random numbers go on and do not repeat."""
+        self.earlier_steps += self.num_timesteps
+        self.num_timesteps = 0
 
     def reset(self, *names: str) -> None:
         """Set some counters back to their defaults."""

@@ -252,10 +252,23 @@ class HeadStart(BaseCallback):
         super().__init__()
         self.path = run / HEAD_START_MODEL
 
-    def _on_rollout_start(self) -> None:
-        delay = getattr(self.model, "actor_delay", 0)
-        if delay and not self.path.exists() and getattr(self.model, "task_updates", 0) >= delay:
-            self.model.save(self.path)
+    def _on_training_start(self) -> None:
+        agent: Any = self.model
+        delay = getattr(agent, "actor_delay", 0)
+        if not delay:
+            return
+        update = agent.update
+
+        def update_and_save(metrics: Any) -> None:
+            update(metrics)
+            if agent.task_updates == delay:
+                agent.save(self.path)
+
+        # SB3 calls no callback between updates, and those of imagination may follow at once.
+        agent.update = update_and_save
+
+    def _on_training_end(self) -> None:
+        vars(self.model).pop("update", None)
 
     def _on_step(self) -> bool:
         return True

@@ -260,3 +260,21 @@ def test_of_several_images_one_is_to_be_chosen():
         as_vec_env(Cameras("top", "wrist"), image_key="side")
     with pytest.raises(ValueError, match="image_key='top' chooses from Dict observations"):
         as_vec_env(ClockEnv(), image_key="top")
+
+
+def test_an_environment_of_a_chosen_image_can_be_set_again():
+    model = agent(Cameras("top", "wrist"), image_key="top")
+    model.set_env(model.get_env())
+    assert model.learn(7).num_timesteps == 7
+    with pytest.raises(ValueError, match="image_key='wrist' chooses from Dict"):
+        agent(model.get_env(), image_key="wrist")
+
+
+def test_another_image_is_seen_as_soon_as_the_keyword_is_written():
+    model = agent(Cameras("top", "wrist"), image_key="top").learn(7)
+    model.image_key = "wrist"
+    assert (model.get_env().reset() == 1).all() and model.policy.image_key == "wrist"
+    with pytest.raises(ValueError, match="No entry 'side'"):
+        model.image_key = "side"
+    assert model.image_key == model.policy.image_key == "wrist"
+    assert (model.get_env().reset() == 1).all()

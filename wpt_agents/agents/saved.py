@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, unwrap_vec_normalize
 from torch import Tensor
 
 from wpt_agents.agents.attributes import KeywordAgent
@@ -160,6 +160,25 @@ class SavedAgent(KeywordAgent):
         wrapped = as_vec_env(env, self.hyperparameters.image_key)
         self.check_env(wrapped)
         return wrapped
+
+    def change_hyperparameter(self, name: str, value: Any) -> None:
+        """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
+
+        :raises ValueError: a value that is not allowed, or one that can no longer take effect
+        """
+        before = self.hyperparameters.image_key
+        super().change_hyperparameter(name, value)
+        if name != "image_key" or value == before:
+            return
+        self.policy.image_key = value
+        if self.env is None:
+            return
+        try:  # the environment shows the former entry alone
+            self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)
+        except ValueError:
+            super().change_hyperparameter(name, before)
+            self.policy.image_key = before
+            raise
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Use another environment, with any number of copies.

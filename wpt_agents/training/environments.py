@@ -58,12 +58,22 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
     if isinstance(vec_env.observation_space, spaces.Dict):
         key = _image_key(vec_env.observation_space, image_key)
         vec_env = VecExtractDictObs(vec_env, key) if key is not None else vec_env
-    elif image_key is not None:
+    elif image_key is not None and image_key not in _extracted(vec_env):
         raise ValueError(
             f"image_key={image_key!r} chooses from Dict observations, but the environment's are "
-            f"{vec_env.observation_space}: leave image_key out"
+            f"{vec_env.observation_space}: leave image_key out, or pass image_key=None if it comes "
+            "from a model file"
         )
     return vec_env
+
+
+def _extracted(env: VecEnv) -> list[str]:
+    """Return the entries that wrappers take of Dict observations, as in an agent's `get_env()`."""
+    keys = []
+    while isinstance(env, VecEnvWrapper):
+        keys += [env.key] if isinstance(env, VecExtractDictObs) else []
+        env = env.venv
+    return keys
 
 
 def make(env: Any) -> gym.Env:

@@ -49,6 +49,19 @@ def pretrain(run_dir=None, steps=7, **changes):
     return WPT.pretrain(DATA, steps=steps, run_dir=run_dir, **SETTINGS | changes)
 
 
+def test_the_number_of_updates_may_be_a_whole_float(tmp_path):
+    assert pretrain(steps=2.0, run_dir=tmp_path).pretrain_steps == 2
+    assert R3M.pretrain(DATA, steps=1e0, channels=2, clips=2).pretrain_steps == 1
+
+
+def test_the_run_folder_of_another_agent_is_refused_by_its_name(tmp_path):
+    R3M.pretrain(DATA, steps=1, channels=2, clips=2, run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+        pretrain(run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+        WPT(**SETTINGS).set_parameters(tmp_path / "model.zip")
+
+
 def rows(folder):
     with open(folder / "progress.csv") as file:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]

@@ -270,6 +270,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
                 f"R3M makes each update in one pass, got accumulate={accumulate}: leave it out"
             )
         cls.check_keywords(kwargs)
+        steps = int(steps)  # of 2e4, too
         model = cls(seed=seed, **kwargs)
         model.set_dataset(dataset)
         folder = Path(run_dir) if run_dir is not None else None

@@ -315,6 +315,9 @@ class SavedAgent(KeywordAgent):
         tensors: Mapping[str, Mapping[str, Tensor]],
         names: tuple[str, ...],
     ) -> None:
+        if model_files.WORLD_MODEL not in tensors:  # explorers take a world model, too
+            kind = self.saved_as or type(self).__name__
+            model_files.check_class(header, "The model file", kind)
         # of a `Size` it fills new fields
         trained_with = self.keywords.of(header["hyperparameters"])
         model_files.check_same(trained_with.as_dict(), self.hyperparameters.as_dict(), names)

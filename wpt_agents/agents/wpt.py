@@ -124,6 +124,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
                 model.restore(*read_model(folder / "model.zip"), same)
             steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
+            steps = int(steps)  # of 2e4, too
             with model.operations():
                 pretraining.pretrain(
                     model, world, steps, accumulate, folder, progress_bar, callback

@@ -171,6 +171,15 @@ def test_a_reset_can_be_spared_when_the_environment_is_set_again():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
 
 
+def test_attributes_that_are_set_on_a_vec_env_reach_its_environments():
+    env = clocks(2)
+    model = agent(env)
+    env.set_attr("length", 3, indices=1)
+    assert env.get_attr("length") == [7, 3]
+    model.learn(14)
+    assert sorted(len(t) for t in model.replay_buffer.trajectories) == [3, 3, 7]
+
+
 @pytest.mark.parametrize(
     "make", [ClockEnv, lambda: gym.make_vec("Clock-v0", 2), lambda: VecMonitor(clocks(2))]
 )

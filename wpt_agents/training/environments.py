@@ -157,6 +157,13 @@ class OwnObservation(gym.ObservationWrapper):
     [0, 1] would become black, and a grayscale image would fill all three channels.
     """
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set it on the environment, as `set_attr` of a DummyVecEnv does without this wrapper."""
+        if name == "env" or name.startswith("_"):  # what Gymnasium's wrappers keep themselves
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
+
     def observation(self, observation: Any) -> Any:
         """Return a copy."""
         if isinstance(self.observation_space, spaces.Dict):

@@ -12,7 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from debug_agent import SETTINGS, recorded, same, weights
+from gymnasium.spaces import Discrete
+from gymnasium.wrappers import TransformAction
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from toy_env import DotEnv
 
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.wpt import WPT
@@ -52,6 +55,16 @@ def pretrain(run_dir=None, steps=7, **changes):
 def test_the_number_of_updates_may_be_a_whole_float(tmp_path):
     assert pretrain(steps=2.0, run_dir=tmp_path).pretrain_steps == 2
     assert R3M.pretrain(DATA, steps=1e0, channels=2, clips=2).pretrain_steps == 1
+
+
+@pytest.mark.parametrize("kind", [WPT, R3M])
+def test_an_environment_that_does_not_suit_is_refused_before_anything_is_trained(kind, tmp_path):
+    settings = SETTINGS if kind is WPT else {"channels": 2, "clips": 2}
+    with pytest.raises(ValueError, match="the environment takes Discrete"):
+        kind.pretrain(
+            DATA, TransformAction(DotEnv(), int, Discrete(2)), 1, run_dir=tmp_path, **settings
+        )
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_run_folder_of_another_agent_is_refused_by_its_name(tmp_path):

@@ -57,6 +57,8 @@ class StoredTrajectories:
 
         :raises ValueError: the trajectory is damaged
         """
+        if isinstance(i, slice):
+            raise TypeError("A dataset has no slices: use subset(range(...)) for several")
         entry = self._entries[i]
         part, _, _ = self._read((i % len(self), 0, entry.length + 1))
         return Trajectory(**vars(part))

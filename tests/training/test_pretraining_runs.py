@@ -14,6 +14,7 @@ import pytest
 from debug_agent import SETTINGS, recorded, same, weights
 from gymnasium.spaces import Discrete
 from gymnasium.wrappers import TransformAction
+from stable_baselines3.common.callbacks import CheckpointCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_env import DotEnv
 
@@ -55,6 +56,12 @@ def pretrain(run_dir=None, steps=7, **changes):
 def test_the_number_of_updates_may_be_a_whole_float(tmp_path):
     assert pretrain(steps=2.0, run_dir=tmp_path).pretrain_steps == 2
     assert R3M.pretrain(DATA, steps=1e0, channels=2, clips=2).pretrain_steps == 1
+
+
+def test_a_callback_of_sb3_is_refused_before_the_first_update(tmp_path):
+    with pytest.raises(ValueError, match="a CheckpointCallback cannot be: pass a function"):
+        pretrain(tmp_path, callback=CheckpointCallback(1, str(tmp_path)))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", [WPT, R3M])

@@ -278,3 +278,25 @@ def test_another_image_is_seen_as_soon_as_the_keyword_is_written():
         model.image_key = "side"
     assert model.image_key == model.policy.image_key == "wrist"
     assert (model.get_env().reset() == 1).all()
+
+
+class Labelled(Cameras):
+    """A camera beside a mask and the colours of two objects, which are no images."""
+
+    def __init__(self):
+        super().__init__("top")
+        extra = {"mask": (64, 64), "colours": (2, 3)}
+        boxes = {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in extra.items()}
+        self.observation_space = spaces.Dict({**self.observation_space.spaces, **boxes})
+
+    def _seen(self, image):
+        extra = {name: self.observation_space[name].sample() for name in ("mask", "colours")}
+        return {**super()._seen(image), **extra}
+
+
+@pytest.mark.filterwarnings("ignore:Of the Dict", "ignore:Evaluation environment")
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_in_a_batch_of_dictionaries_arrays_of_two_axes_are_not_taken_for_images(n):
+    model = agent(Labelled())
+    assert evaluate_policy(model, DummyVecEnv([Labelled] * n), n)[0] == 28
+    assert model.predict(Labelled().reset()[0])[0].shape == (2,)

@@ -82,6 +82,23 @@ def test_the_seeds_of_a_vector_count_up_from_the_agents_own():
     assert [env.unwrapped.seed for env in vector.envs] == [5, 6]
 
 
+def test_options_of_a_reset_reach_the_environments_of_a_vector_once():
+    class Choosy(ClockEnv):
+        def reset(self, *, seed=None, options=None):
+            self.options = options
+            return super().reset(seed=seed)
+
+    vector = SyncVectorEnv([Choosy, Choosy])
+    env = as_vec_env(vector)
+    for options in ({"level": 3}, None):
+        env.set_options(options)
+        env.reset()
+        assert [env.unwrapped.options for env in vector.envs] == [options] * 2
+    env.set_options([{"level": 1}, {"level": 2}])
+    with pytest.raises(ValueError, match="same options for all"):
+        env.reset()
+
+
 class Own(VectorEnv):
     """A vector environment of two clocks that are stepped in its own code."""
 

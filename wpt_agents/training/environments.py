@@ -214,7 +214,7 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
 def last_reset(env: VecEnv) -> object:
     """Return what is another object after each call of `reset`, whoever calls it.
 
-    Every VecEnv of SB3 makes its options anew then; those who do not are taken to be untouched.
+    Every VecEnv of SB3 makes new options then; one that does not is taken to be untouched.
     """
     return getattr(innermost(env), "_options", None)
 

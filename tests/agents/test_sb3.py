@@ -171,6 +171,26 @@ def test_a_reset_can_be_spared_when_the_environment_is_set_again():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
 
 
+def test_attributes_that_are_set_on_a_vec_env_reach_its_environments():
+    env = clocks(2)
+    model = agent(env)
+    env.set_attr("length", 3, indices=1)
+    assert env.get_attr("length") == [7, 3]
+    model.learn(14)
+    assert sorted(len(t) for t in model.replay_buffer.trajectories) == [3, 3, 7]
+
+
+@pytest.mark.parametrize(
+    "make", [ClockEnv, lambda: gym.make_vec("Clock-v0", 2), lambda: VecMonitor(clocks(2))]
+)
+def test_after_an_evaluation_on_its_own_environment_new_episodes_begin(make, clock_id):
+    model = agent(make()).learn(8)  # in the middle of episodes
+    evaluate_policy(model, model.get_env(), 1, warn=False)
+    model.learn(28, reset_num_timesteps=False)
+    episodes = model.replay_buffer.trajectories
+    assert len(episodes) >= 3 and all(on_time(t) for t in episodes)
+
+
 @pytest.mark.parametrize("bounds", [(-0.3, 0.7), (0.0, 10.0), (-1.0, 1.0)])
 def test_actions_are_scaled_to_the_bounds_of_the_environment(bounds):
     env = ClockEnv(low=bounds[0], high=bounds[1])  # it asserts that its space holds each action

@@ -294,6 +294,13 @@ def test_retrieval_without_data_of_the_width_says_what_to_do(store):
         model.learn(1)
 
 
+def test_retrieval_without_data_of_the_width_names_the_robot_that_was_asked_for():
+    data = [recorded(embodiment="a"), recorded(actions=3, embodiment="b")]
+    model = pretrained(data, env=DotEnv(actions=3), embodiment="a")
+    with pytest.raises(ValueError, match=r"3 actions of the robot 'a'.*set another embodiment"):
+        model.learn(1)
+
+
 def test_the_index_is_kept_beside_the_dataset_and_used_again(store, monkeypatch):
     pretrained(store).build_index()
     monkeypatch.setattr(Retriever, "build", None)

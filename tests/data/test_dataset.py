@@ -271,6 +271,13 @@ def test_an_index_past_the_end_is_an_index_error(tmp_path):
         made(tmp_path, chain(4))[1]
 
 
+def test_a_slice_is_refused_with_what_to_write(tmp_path):
+    dataset = made(tmp_path, *(chain(5 + i) for i in range(3)))
+    with pytest.raises(TypeError, match="use subset"):
+        dataset[:2]
+    assert dataset.subset(range(2)).lengths.tolist() == [5, 6]
+
+
 def test_a_subset_by_mask_is_of_those_that_are_true(tmp_path):
     dataset = made(tmp_path, *(chain(5 + i) for i in range(3)))
     for mask in ([False, True, True], dataset.lengths > 5):

@@ -221,6 +221,14 @@ def test_episodes_of_a_single_image_are_left_out_aloud(tmp_path, save):
     assert TrajectoryDataset.from_episodes(episodes, tmp_path / "out").lengths.tolist() == [5, 7]
 
 
+def test_an_npz_file_without_an_image_is_left_out_as_one_of_a_single_image_is(tmp_path):
+    save_npz(tmp_path / "0.npz", chain(5))
+    empty = {"observation": np.zeros((0, 8, 8, 3), np.uint8), "action": np.zeros((0, 2))}
+    np.savez(tmp_path / "1.npz", **empty)
+    with pytest.warns(UserWarning, match="1 episode of a single image left out"):
+        assert [len(t) for t in NpzEpisodes(tmp_path, **SMALL)] == [5]
+
+
 def test_npz_episodes_come_by_name_from_every_folder(tmp_path):
     for name, n in (("b/1", 5), ("a/2", 6), ("a/1", 7)):
         save_npz(tmp_path / f"{name}.npz", chain(n))

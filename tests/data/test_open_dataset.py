@@ -1,11 +1,13 @@
 """`open_dataset` takes whatever can serve as a dataset."""
 
+import copy
 import inspect
 
 import numpy as np
 import pytest
 from chain import chain
 
+from wpt_agents.data import reading
 from wpt_agents.data.convert import open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.importers.formats import FORMATS
@@ -49,6 +51,23 @@ def test_trajectories_one_or_many_are_stored_in_a_temporary_folder():
     assert len(view[0]) == 5 and path.exists()  # a view keeps the folder
     del view
     assert not path.exists()
+
+
+def test_a_copy_keeps_the_temporary_folder_of_its_original():
+    dataset = open_dataset(chain(5, size=64))
+    path, copied = dataset.path, copy.deepcopy(dataset)
+    del dataset
+    assert len(copied[0]) == 5
+    del copied
+    assert not path.exists()
+
+
+def test_a_dataset_of_a_relative_path_is_read_from_another_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    dataset = stored("a", chain(5, size=64))
+    monkeypatch.chdir(tmp_path / "a")
+    monkeypatch.setattr(reading, "PAUSES", ())
+    assert len(dataset[0]) == 5
 
 
 def test_the_constructors_are_documented_functions():

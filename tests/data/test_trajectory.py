@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -95,6 +97,7 @@ def test_stacked_windows_keep_to_the_chain():
         ({"image": IMAGE.astype(np.float32)}, "float32"),
         ({"image": IMAGE[:3]}, "T = 2 >= 1 for 3 images"),
         ({"image": IMAGE[:1], "action": ACTION[:0]}, "T = 0 >= 1"),
+        ({"action": ACTION[:, :0]}, r"must be \(T, A\) .* got \(3, 0\)"),
         ({"action": np.full((3, 2), np.nan)}, r"finite and in \[-1, 1\]"),
         ({"action": np.full((3, 2), 2.0)}, "rescale"),
         ({"reward": np.zeros((3, 1))}, "reward must be finite and of shape"),
@@ -105,6 +108,11 @@ def test_stacked_windows_keep_to_the_chain():
 def test_a_wrong_trajectory_is_refused(arguments, culprit):
     with pytest.raises(ValueError, match=culprit):
         Trajectory(**{"image": IMAGE, "action": ACTION, **arguments})
+
+
+def test_labels_become_text():
+    labelled = Trajectory(IMAGE, ACTION, task=np.int64(3), source=Path("a", "b.h5"))
+    assert (labelled.embodiment, labelled.task, labelled.source) == (None, "3", "a/b.h5")
 
 
 def test_it_is_shown_without_its_pixels():

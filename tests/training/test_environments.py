@@ -82,6 +82,23 @@ def test_the_seeds_of_a_vector_count_up_from_the_agents_own():
     assert [env.unwrapped.seed for env in vector.envs] == [5, 6]
 
 
+def test_options_of_a_reset_reach_the_environments_of_a_vector_once():
+    class Choosy(ClockEnv):
+        def reset(self, *, seed=None, options=None):
+            self.options = options
+            return super().reset(seed=seed)
+
+    vector = SyncVectorEnv([Choosy, Choosy])
+    env = as_vec_env(vector)
+    for options in ({"level": 3}, None):
+        env.set_options(options)
+        env.reset()
+        assert [env.unwrapped.options for env in vector.envs] == [options] * 2
+    env.set_options([{"level": 1}, {"level": 2}])
+    with pytest.raises(ValueError, match="same options for all"):
+        env.reset()
+
+
 class Own(VectorEnv):
     """A vector environment of two clocks that are stepped in its own code."""
 
@@ -260,3 +277,43 @@ def test_of_several_images_one_is_to_be_chosen():
         as_vec_env(Cameras("top", "wrist"), image_key="side")
     with pytest.raises(ValueError, match="image_key='top' chooses from Dict observations"):
         as_vec_env(ClockEnv(), image_key="top")
+
+
+def test_an_environment_of_a_chosen_image_can_be_set_again():
+    model = agent(Cameras("top", "wrist"), image_key="top")
+    model.set_env(model.get_env())
+    assert model.learn(7).num_timesteps == 7
+    with pytest.raises(ValueError, match="image_key='wrist' chooses from Dict"):
+        agent(model.get_env(), image_key="wrist")
+
+
+def test_another_image_is_seen_as_soon_as_the_keyword_is_written():
+    model = agent(Cameras("top", "wrist"), image_key="top").learn(7)
+    model.image_key = "wrist"
+    assert (model.get_env().reset() == 1).all() and model.policy.image_key == "wrist"
+    with pytest.raises(ValueError, match="No entry 'side'"):
+        model.image_key = "side"
+    assert model.image_key == model.policy.image_key == "wrist"
+    assert (model.get_env().reset() == 1).all()
+
+
+class Labelled(Cameras):
+    """A camera beside a mask and the colours of two objects, which are no images."""
+
+    def __init__(self):
+        super().__init__("top")
+        extra = {"mask": (64, 64), "colours": (2, 3)}
+        boxes = {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in extra.items()}
+        self.observation_space = spaces.Dict({**self.observation_space.spaces, **boxes})
+
+    def _seen(self, image):
+        extra = {name: self.observation_space[name].sample() for name in ("mask", "colours")}
+        return {**super()._seen(image), **extra}
+
+
+@pytest.mark.filterwarnings("ignore:Of the Dict", "ignore:Evaluation environment")
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_in_a_batch_of_dictionaries_arrays_of_two_axes_are_not_taken_for_images(n):
+    model = agent(Labelled())
+    assert evaluate_policy(model, DummyVecEnv([Labelled] * n), n)[0] == 28
+    assert model.predict(Labelled().reset()[0])[0].shape == (2,)

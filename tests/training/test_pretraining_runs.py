@@ -12,7 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from debug_agent import SETTINGS, recorded, same, weights
+from gymnasium.spaces import Discrete
+from gymnasium.wrappers import TransformAction
+from stable_baselines3.common.callbacks import CheckpointCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from toy_env import DotEnv
 
 from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.wpt import WPT
@@ -47,6 +51,35 @@ def attended():
 
 def pretrain(run_dir=None, steps=7, **changes):
     return WPT.pretrain(DATA, steps=steps, run_dir=run_dir, **SETTINGS | changes)
+
+
+def test_the_number_of_updates_may_be_a_whole_float(tmp_path):
+    assert pretrain(steps=2.0, run_dir=tmp_path).pretrain_steps == 2
+    assert R3M.pretrain(DATA, steps=1e0, channels=2, clips=2).pretrain_steps == 1
+
+
+def test_a_callback_of_sb3_is_refused_before_the_first_update(tmp_path):
+    with pytest.raises(ValueError, match="a CheckpointCallback cannot be: pass a function"):
+        pretrain(tmp_path, callback=CheckpointCallback(1, str(tmp_path)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [WPT, R3M])
+def test_an_environment_that_does_not_suit_is_refused_before_anything_is_trained(kind, tmp_path):
+    settings = SETTINGS if kind is WPT else {"channels": 2, "clips": 2}
+    with pytest.raises(ValueError, match="the environment takes Discrete"):
+        kind.pretrain(
+            DATA, TransformAction(DotEnv(), int, Discrete(2)), 1, run_dir=tmp_path, **settings
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_run_folder_of_another_agent_is_refused_by_its_name(tmp_path):
+    R3M.pretrain(DATA, steps=1, channels=2, clips=2, run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+        pretrain(run_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+        WPT(**SETTINGS).set_parameters(tmp_path / "model.zip")
 
 
 def rows(folder):

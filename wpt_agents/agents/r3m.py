@@ -270,7 +270,9 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
                 f"R3M makes each update in one pass, got accumulate={accumulate}: leave it out"
             )
         cls.check_keywords(kwargs)
+        steps = int(steps)  # of 2e4, too
         model = cls(seed=seed, **kwargs)
+        checked = None if env is None else model._checked(env)  # not after hours of training
         model.set_dataset(dataset)
         folder = Path(run_dir) if run_dir is not None else None
         if folder is not None and (folder / "model.zip").exists():
@@ -281,8 +283,8 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         elif folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             model.save(folder / "model.zip")
-        if env is not None:
-            model.set_env(env)
+        if checked is not None:
+            model._use_env(checked)
         return model
 
     def _pretrain(self, steps: int, run: Pretraining, progress_bar: bool) -> None:

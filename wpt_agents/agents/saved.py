@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, unwrap_vec_normalize
 from torch import Tensor
 
 from wpt_agents.agents.attributes import KeywordAgent
@@ -24,7 +24,7 @@ from wpt_agents.model.actions import space_as_dict, space_from_dict
 from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
-from wpt_agents.training.environments import as_vec_env
+from wpt_agents.training.environments import as_vec_env, last_reset
 from wpt_agents.training.randomness import Streams, torch_seed
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
@@ -50,6 +50,7 @@ class SavedAgent(KeywordAgent):
     action_space: spaces.Box
     _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
     _last_episode_starts: Any
+    _reset_seen: object = None  # of `last_reset`, when the environment was last in our hands
 
     def __init__(
         self,
@@ -161,6 +162,25 @@ class SavedAgent(KeywordAgent):
         self.check_env(wrapped)
         return wrapped
 
+    def change_hyperparameter(self, name: str, value: Any) -> None:
+        """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
+
+        :raises ValueError: a value that is not allowed, or one that can no longer take effect
+        """
+        before = self.hyperparameters.image_key
+        super().change_hyperparameter(name, value)
+        if name != "image_key" or value == before:
+            return
+        self.policy.image_key = value
+        if self.env is None:
+            return
+        try:  # the environment shows the former entry alone
+            self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)
+        except ValueError:
+            super().change_hyperparameter(name, before)
+            self.policy.image_key = before
+            raise
+
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Use another environment, with any number of copies.
 
@@ -176,6 +196,7 @@ class SavedAgent(KeywordAgent):
         assert isinstance(env.action_space, spaces.Box)
         other = env.action_space.shape != self.action_space.shape
         self.env = env
+        self._reset_seen = last_reset(env)
         self.n_envs = env.num_envs
         self._vec_normalize_env = unwrap_vec_normalize(env)
         self.observation_space = env.observation_space
@@ -294,6 +315,9 @@ class SavedAgent(KeywordAgent):
         tensors: Mapping[str, Mapping[str, Tensor]],
         names: tuple[str, ...],
     ) -> None:
+        if model_files.WORLD_MODEL not in tensors:  # explorers take a world model, too
+            kind = self.saved_as or type(self).__name__
+            model_files.check_class(header, "The model file", kind)
         # of a `Size` it fills new fields
         trained_with = self.keywords.of(header["hyperparameters"])
         model_files.check_same(trained_with.as_dict(), self.hyperparameters.as_dict(), names)
@@ -322,6 +346,6 @@ class SavedAgent(KeywordAgent):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""
-        left_out = {"env", "_vec_normalize_env", "_last_obs", "rollout"}
+        left_out = {"env", "_vec_normalize_env", "_last_obs", "_reset_seen", "rollout"}
         state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
         return state | {"_custom_logger": False}

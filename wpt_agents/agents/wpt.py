@@ -117,6 +117,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         with joined(device) as world:
             seed = pretraining.common_seed(world, seed)
             model = cls(size=size, seed=seed, device=device, **kwargs)
+            checked = None if env is None else model._checked(env)  # not after days of training
             with world.rank_0_first():
                 model.set_dataset(dataset)
             folder = Path(run_dir) if run_dir is not None else None
@@ -124,12 +125,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
                 model.restore(*read_model(folder / "model.zip"), same)
             steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
+            steps = int(steps)  # of 2e4, too
             with model.operations():
                 pretraining.pretrain(
                     model, world, steps, accumulate, folder, progress_bar, callback
                 )
-        if env is not None:
-            model.set_env(env)
+        if checked is not None:
+            model._use_env(checked)
         return model
 
     # // Task-Specific Training

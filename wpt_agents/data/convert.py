@@ -122,10 +122,22 @@ def refuse_object(data: Any) -> None:
         )
 
 
+class TemporaryFolder:
+    """A folder that is removed with the last of the datasets that read it, copies included."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="wpt_dataset_"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+    def __deepcopy__(self, memo: object) -> "TemporaryFolder":
+        return self
+
+
 def _stored(trajectories: Iterable[Trajectory]) -> TrajectoryDataset:
-    """A dataset in a temporary folder, which is removed with it."""
-    dataset = TrajectoryDataset.create(tempfile.mkdtemp(prefix="wpt_dataset_"))
-    weakref.finalize(dataset, shutil.rmtree, dataset.path, ignore_errors=True)
+    """A dataset in a temporary folder, which is removed with it and its copies."""
+    folder = TemporaryFolder()
+    dataset = TrajectoryDataset.create(folder.path)
+    dataset._whole = folder
     with dataset:
         dataset.extend(trajectories)
     return dataset

@@ -107,7 +107,7 @@ class TrajectoryDataset(StoredTrajectories):
         :param workers: number of threads that decompress
         :raises ValueError: there is no dataset, it is of a newer version, or its index is damaged
         """
-        path = Path(path).expanduser()
+        path = Path(path).expanduser().absolute()  # the process may go to another folder later
         meta = read_meta(path)
         find_codec(meta.codec)
         return cls([Folder(path, meta)], undamaged(path, read_index(path)[0]), workers=workers)

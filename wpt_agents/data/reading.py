@@ -43,7 +43,7 @@ class StoredTrajectories:
         self._entries = entries
         self._folder_of = folder_of
         self._ids = ids
-        self._whole: object = None  # what a view must keep alive: a temporary folder's dataset
+        self._whole: object = None  # what must stay alive: a temporary folder, a view's dataset
         self._windows: Windows | None = None
         self._backgrounds: dict[object, np.ndarray] = {}  # 12 kB for each trajectory seen
         self._threads = Threads(workers)
@@ -57,6 +57,8 @@ class StoredTrajectories:
 
         :raises ValueError: the trajectory is damaged
         """
+        if isinstance(i, slice):
+            raise TypeError("A dataset has no slices: use subset(range(...)) for several")
         entry = self._entries[i]
         part, _, _ = self._read((i % len(self), 0, entry.length + 1))
         return Trajectory(**vars(part))

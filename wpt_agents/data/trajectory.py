@@ -74,7 +74,7 @@ class Trajectory:
                 f"Trajectory.image must be (T + 1, H, W, 3) uint8, got {image.shape} {image.dtype}"
                 f"{remedy}"
             )
-        if action.ndim != 2 or len(action) != len(image) - 1 or len(action) == 0:
+        if action.ndim != 2 or len(action) != len(image) - 1 or action.size == 0:
             raise ValueError(
                 f"Trajectory.action must be (T, A) with T = {len(image) - 1} >= 1 for "
                 f"{len(image)} images, got {action.shape}"
@@ -102,6 +102,9 @@ class Trajectory:
                     f"of each action, got {bounds.shape}"
                 )
             object.__setattr__(self, "bounds", bounds)
+        for name in ("embodiment", "task", "source"):
+            if (label := getattr(self, name)) is not None:  # a Path, for example
+                object.__setattr__(self, name, str(label))
         object.__setattr__(self, "terminated", bool(self.terminated))
         object.__setattr__(self, "reward", reward)
 

@@ -73,8 +73,7 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
 
 def _key_of(observation: Mapping[str, Any], image_key: str | None) -> str:
     arrays = {key: np.asarray(value) for key, value in observation.items()}
-    shapes = {key: (x.shape[-3:], x.dtype) for key, x in arrays.items() if x.ndim in (3, 4)}
-    images = image_keys(shapes) if image_key is None else [image_key]
+    images = _images_in(arrays) if image_key is None else [image_key]
     if len(images) != 1 or images[0] not in arrays:
         entries = ", ".join(f"{key!r} {x.shape} {x.dtype}" for key, x in arrays.items())
         raise ValueError(
@@ -82,6 +81,21 @@ def _key_of(observation: Mapping[str, Any], image_key: str | None) -> str:
             f"of {entries}: pass the image alone"
         )
     return images[0]
+
+
+def _images_in(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    """Return the entries that are images, or batches of them; not both.
+
+    In a batch, (n, 64, 64) may be masks of n environments, and look like the channels of an image.
+    """
+    batched = len({x.shape[:1] for x in arrays.values()}) == 1
+    for dims in (4, 3) if batched else (3, 4):
+        images = image_keys(
+            {k: (x.shape[-3:], x.dtype) for k, x in arrays.items() if x.ndim == dims}
+        )
+        if images:
+            return images
+    return []
 
 
 def _range(observation: np.ndarray) -> str:

@@ -58,12 +58,22 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
     if isinstance(vec_env.observation_space, spaces.Dict):
         key = _image_key(vec_env.observation_space, image_key)
         vec_env = VecExtractDictObs(vec_env, key) if key is not None else vec_env
-    elif image_key is not None:
+    elif image_key is not None and image_key not in _extracted(vec_env):
         raise ValueError(
             f"image_key={image_key!r} chooses from Dict observations, but the environment's are "
-            f"{vec_env.observation_space}: leave image_key out"
+            f"{vec_env.observation_space}: leave image_key out, or pass image_key=None if it comes "
+            "from a model file"
         )
     return vec_env
+
+
+def _extracted(env: VecEnv) -> list[str]:
+    """Return the entries that wrappers take of Dict observations, as in an agent's `get_env()`."""
+    keys = []
+    while isinstance(env, VecEnvWrapper):
+        keys += [env.key] if isinstance(env, VecExtractDictObs) else []
+        env = env.venv
+    return keys
 
 
 def make(env: Any) -> gym.Env:
@@ -147,6 +157,13 @@ class OwnObservation(gym.ObservationWrapper):
     [0, 1] would become black, and a grayscale image would fill all three channels.
     """
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set it on the environment, as `set_attr` of a DummyVecEnv does without this wrapper."""
+        if name == "env" or name.startswith("_"):  # what Gymnasium's wrappers keep themselves
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
+
     def observation(self, observation: Any) -> Any:
         """Return a copy."""
         if isinstance(self.observation_space, spaces.Dict):
@@ -192,6 +209,14 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
     while isinstance(env, VecEnvWrapper):
         env = env.venv
     return env
+
+
+def last_reset(env: VecEnv) -> object:
+    """Return what is another object after each call of `reset`, whoever calls it.
+
+    Every VecEnv of SB3 makes new options then; one that does not is taken to be untouched.
+    """
+    return getattr(innermost(env), "_options", None)
 
 
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:

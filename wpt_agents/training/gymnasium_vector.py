@@ -34,9 +34,14 @@ class GymnasiumVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Return the first observations; the seeds of `seed` apply to one reset."""
-        seeds = [None if seed is None else int(seed) for seed in self._seeds]
-        obs, infos = self.vector.reset(seed=None if None in seeds else seeds)  # type: ignore
+        """Return the first observations; `seed` and `set_options` apply to one reset."""
+        seeds: Any = [None if seed is None else int(seed) for seed in self._seeds]
+        options = self._options[0]
+        if any(other != options for other in self._options):
+            raise ValueError("A Gymnasium vector takes the same options for all environments")
+        obs, infos = self.vector.reset(
+            seed=None if None in seeds else seeds, options=options or None
+        )
         self.reset_infos = [_of_one(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()

@@ -117,6 +117,11 @@ class Pretraining:
         callback: Callback | None = None,
         world: World | None = None,
     ) -> None:
+        if callback is not None and not callable(callback):
+            raise ValueError(
+                f"callback is called with (step, metrics), and a {type(callback).__name__} cannot "
+                "be: pass a function. Callbacks of Stable-Baselines3 are for `learn`"
+            )
         self.agent = agent
         self.steps = steps
         self.run_dir = run_dir

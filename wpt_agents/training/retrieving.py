@@ -50,9 +50,11 @@ def retrieve_ids(
     else:
         numbers, _ = retriever.search(query, number, known, width)
     if len(numbers) == 0:
+        whose = "" if known is None else f" of the robot {known!r}, or of none,"
         raise ValueError(
-            f"The dataset {dataset.path} has no trajectory of {width} actions to retrieve; add "
-            "some, or learn with offline_ratio=0, guidance=0, kickstart=0"
+            f"The dataset {dataset.path} has no trajectory of {width} actions{whose} to retrieve; "
+            f"add some{', set another embodiment' * bool(whose)}, or learn with offline_ratio=0, "
+            "guidance=0, kickstart=0"
         )
     return [int(i) for i in numbers]
 

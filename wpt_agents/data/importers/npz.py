@@ -66,7 +66,7 @@ class NpzEpisodes(Episodes):
         warn_left_out(list(kinds.values()).count("single"), folder)
 
     def _kind(self, file: Path) -> str:
-        """Return the kind of a file: "episode", "single" (of one image), "flat" or "other".
+        """Return the kind of a file: "episode", "single" (of one image at most), "flat" or "other".
 
         Damaged files count as episodes, so that reading them raises an error that names them.
         """
@@ -80,7 +80,7 @@ class NpzEpisodes(Episodes):
                 return "other"
             if actions and len(arrays_of(file, set(actions)).get(actions[0], ())) <= 1:
                 lengths = {len(array) for array in arrays_of(file, set(images)).values()}
-                return "single" if lengths == {1} else "episode"
+                return "single" if lengths and max(lengths) <= 1 else "episode"
         except (ValueError, TypeError):  # TypeError: a number in place of an array
             pass
         return "episode"

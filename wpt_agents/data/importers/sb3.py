@@ -108,7 +108,8 @@ class SB3Episodes(Episodes):
             return np.asarray(observations)
         if self.image_key not in observations:
             raise ValueError(
-                f"The replay buffer's observations are {', '.join(observations)}; pass image_key"
+                f"The replay buffer's observations are {', '.join(observations)}; pass image_key: "
+                "TrajectoryDataset.from_sb3(buffer, path, image_key=...)"
             )
         return np.asarray(observations[self.image_key])
 

@@ -430,23 +430,27 @@ def test_a_return_scale_that_is_switched_on_later_starts_from_the_first_returns(
 # ----------------------------------------------------------------- what DreamerV3 does otherwise
 
 
-def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula():
+@pytest.mark.parametrize("ends", [False, True])
+def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula(ends):
     model = filled(actor_grad="reinforce", ent_coef=0.1, gamma=0.9)
     learner, policy = model.learner, model.policy
     start = policy.world_model.rssm.initial(6)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         imagined = learner.imagine(start, torch.arange(6), generator)
-    loss = learner.actor_loss(imagined, torch.tensor(2.0))
     dream, reward, value, returns, _ = imagined
+    goes_on = torch.rand(returns.shape, generator=generator) if ends else None
+    loss = learner.actor_loss(imagined._replace(goes_on=goes_on), torch.tensor(2.0))
+    going = torch.ones_like(returns) if goes_on is None else goes_on
     expected = 0.0
     for n in range(6):
         for t in range(dream.action.shape[1] - 1):
             feat = torch.cat([dream.states.deter[n, t], dream.states.stoch[n, t].flatten()])
             dist = policy.actor.dist(feat, policy.action_mask)
-            better = reward[n, t] + 0.9 * returns[n, t + 1] - value[n, t]
+            better = reward[n, t] + 0.9 * going[n, t] * returns[n, t + 1] - value[n, t]
             gain = dist.log_prob(dream.action[n, t]) * better / 2 + 0.1 * dist.entropy()
-            expected -= 0.9**t * gain / (6 * (dream.action.shape[1] - 1))
+            reached = going[n, :t].prod()  # the probability that step t is reached
+            expected -= 0.9**t * reached * gain / (6 * (dream.action.shape[1] - 1))
     torch.testing.assert_close(loss, expected)
     loss.backward()
     assert all(p.grad is None for p in policy.world_model.parameters())

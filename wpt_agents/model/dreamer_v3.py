@@ -45,7 +45,7 @@ def reinforce_loss(
     :param log_prob: (N, H - 1), of the actions taken, as constants
     :param advantage: (N, H - 1)
     :param entropy: (N, H - 1)
-    :param weight: (H - 1,) or (N, H - 1), the discounts γ^t
+    :param weight: (H - 1,) or (N, H - 1), γ^t, or γ^t Π_{k<t} c_k where episodes may end
     :param return_scale: S, what returns are divided by
     """
     assert log_prob.shape == advantage.shape == entropy.shape, (log_prob.shape, entropy.shape)

@@ -11,12 +11,13 @@ from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import (
     Actor,
     actor_loss,
-    actor_weight,
     critic_loss,
+    discounts,
     draw_starts,
     ema_update,
     lambda_return,
     return_range,
+    survival,
 )
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss, recent_frames
 from wpt_agents.model.dreamer_v3 import (
@@ -255,11 +256,14 @@ class Learner(WorldModelLearner):
             return actor_loss(returns, dream.entropy, ent_coef, gamma, scale, goes_on)
         feat = dream.states.but_last().but_last().feat.detach()
         dist = self.policy.actor.dist(feat, self.policy.action_mask)
+        weight = discounts(returns.shape[1] - 1, gamma, returns)
+        if goes_on is not None:  # without c_t, which the advantage contains
+            weight = weight * survival(goes_on)[:, :-1]
         return reinforce_loss(
             dist.log_prob(dream.action[:, :-1].detach()),
             advantage(reward, value, returns, gamma if goes_on is None else gamma * goes_on),
             dist.entropy(),
-            actor_weight(gamma, returns, goes_on),
+            weight,
             ent_coef,
             scale,
         )

@@ -100,6 +100,14 @@ def test_aloha_has_a_file_an_episode(tmp_path):
     check(one, old[1], len(old[1]))
 
 
+def test_files_of_several_formats_in_a_folder_are_not_left_out_in_silence(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(5)], False, ("agentview_rgb",))
+    np.savez(tmp_path / "b.npz", image=chain(5).image)
+    np.savez(tmp_path / "c.npz", image=chain(5).image)
+    with pytest.warns(UserWarning, match="of format hdf5 are read, and 2 of format npz are left"):
+        assert recognise(tmp_path) == "hdf5"
+
+
 def as_files(images, kind):
     """Encodes each image; PNG for exact colours, JPEG as ALOHA does."""
     streams = [io.BytesIO() for _ in images]

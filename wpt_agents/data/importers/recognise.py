@@ -3,6 +3,7 @@
 import difflib
 import os
 import re
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -49,10 +50,18 @@ def _folder_format(path: Path) -> str | None:
         return None
     if holds_official(path):
         return "official"
+    counts: dict[str, int] = {}
     for pattern, form in IN_FOLDERS:
-        if next(path.rglob(pattern), None):
-            return form
-    return None
+        counts[form] = counts.get(form, 0) + len(list(path.rglob(pattern)))
+    used, *others = [form for form, count in counts.items() if count] or [None]
+    if others:
+        left = " and ".join(f"{counts[form]} of format {form}" for form in others)
+        warnings.warn(
+            f"{path} has files of several formats: those of format {used} are read, and {left} are "
+            "left out. Put each format in a folder of its own, and pass a list of the folders",
+            stacklevel=4,
+        )
+    return used
 
 
 def _is_minari(folder: Path) -> bool:

@@ -53,7 +53,10 @@ def _folder_format(path: Path) -> str | None:
     counts: dict[str, int] = {}
     for pattern, form in IN_FOLDERS:
         counts[form] = counts.get(form, 0) + len(list(path.rglob(pattern)))
-    used, *others = [form for form, count in counts.items() if count] or [None]
+    there = [form for form, count in counts.items() if count]
+    if not there:
+        return None
+    used, *others = there
     if others:
         left = " and ".join(f"{counts[form]} of format {form}" for form in others)
         warnings.warn(

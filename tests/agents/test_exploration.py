@@ -243,6 +243,16 @@ def test_exploring_never_goes_on_with_an_episode_that_learn_left():
         assert len(played) == 25
 
 
+@pytest.mark.parametrize("kind", EXPLORERS.values())
+def test_an_explorers_policy_acts_from_a_file_of_its_own(kind, tmp_path):
+    model = explorer(kind)
+    model.policy.save(tmp_path / "policy")
+    loaded = type(model.policy).load(tmp_path / "policy")
+    obs = np.full((3, 64, 64, 3), 90, np.uint8)
+    actions = [policy.predict(obs, deterministic=True)[0] for policy in (model.policy, loaded)]
+    np.testing.assert_array_equal(*actions)
+
+
 def test_an_explorers_file_is_read_by_its_own_class(tmp_path):
     explorer(ICMExplorer).save(tmp_path / "curious.zip")
     for other in (WPT, Plan2Explore):

@@ -119,6 +119,8 @@ class WPTPolicy(PixelPolicy):
         Afterwards there are an average actor and an imitator if the weights have them.
         """
         self.updates += 1
+        if not hasattr(self, "curiosity"):  # an explorer's, which does not take part in acting
+            state_dict = {k: v for k, v in state_dict.items() if not k.startswith("curiosity.")}
         averaged = any(name.startswith("average_actor.") for name in state_dict)
         self.average_actor = deepcopy(self.actor).requires_grad_(False) if averaged else None
         imitates = any(name.startswith("imitator.") for name in state_dict)

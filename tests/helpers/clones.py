@@ -33,7 +33,7 @@ RATES = "wpt_agents.training.cloning.LinearLR"
 
 
 def constant(optimizer: torch.optim.Optimizer, *_: float) -> ConstantLR:
-    """Return a schedule that leaves the learning rate as it is."""
+    """Return a schedule that does not change the learning rate."""
     return ConstantLR(optimizer, factor=1.0)
 
 

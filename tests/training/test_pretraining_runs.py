@@ -76,9 +76,9 @@ def test_an_environment_that_does_not_suit_is_refused_before_anything_is_trained
 
 def test_the_run_folder_of_another_agent_is_refused_by_its_name(tmp_path):
     R3M.pretrain(DATA, steps=1, channels=2, clips=2, run_dir=tmp_path)
-    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+    with pytest.raises(ValueError, match=r"is of R3M: read it with R3M\.load"):
         pretrain(run_dir=tmp_path)
-    with pytest.raises(ValueError, match=r"is of R3M: read it by R3M\.load"):
+    with pytest.raises(ValueError, match=r"is of R3M: read it with R3M\.load"):
         WPT(**SETTINGS).set_parameters(tmp_path / "model.zip")
 
 

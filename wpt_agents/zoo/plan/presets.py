@@ -56,12 +56,21 @@ class EnvSettings(Section):
 
 @dataclass(frozen=True)
 class CollectSettings(Section):
-    """The non-curated data: `episodes` of each of `tasks`, with "noise" or "scripted" policies."""
+    """The non-curated data: `episodes` of each of `tasks`, played by a behaviour of `collect`.
+
+    `steps` are those of the behaviour "explore-state"; 0 is its default.
+    """
 
     tasks: tuple[str, ...] = ()
     episodes: int = 30
     seed: int = 0
     behaviour: str = "noise"
+    steps: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings that the data depend on, with a list of tasks."""
+        values = asdict(self) | {"tasks": list(self.tasks)}
+        return {k: v for k, v in values.items() if k != "steps" or v}  # names of older data
 
 
 @dataclass(frozen=True)
@@ -180,7 +189,7 @@ class Preset:
         values = asdict(self)
         del values["plus"]  # a run's `wpt` contains the part that applies
         del values["agents"]  # a run's own section contains its agent's keywords
-        return values | {"collect": values["collect"] | {"tasks": list(self.collect.tasks)}}
+        return values | {"collect": self.collect.as_dict()}
 
 
 def wpt_keywords() -> Mapping[str, Any]:

@@ -19,6 +19,7 @@ from wpt_agents.files.names import unknown_name
 from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
+from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY
 from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shape
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset
@@ -262,6 +263,11 @@ def check_preset(preset: Preset) -> None:
     ):
         if value not in known:
             raise unknown_name(name, value, known)
+    if preset.collect.steps and preset.collect.behaviour != STATE_CURIOSITY:
+        raise ValueError(
+            f"collect.steps belongs to collect.behaviour={STATE_CURIOSITY}, and has no effect on "
+            f"{preset.collect.behaviour!r}: leave it out"
+        )
 
 
 def check_width(run: Run, widths: Collection[int]) -> None:

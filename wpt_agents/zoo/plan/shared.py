@@ -78,7 +78,7 @@ class Shared:
         """The dataset's folder."""
         if self.given_data is not None:
             return self.given_data.resolve()
-        return self.cache / f"data-{key(asdict(self.preset.collect), self.tasks, self.env)}"
+        return self.cache / f"data-{key(self.preset.collect.as_dict(), self.tasks, self.env)}"
 
     @property
     def episodes(self) -> int:

@@ -55,6 +55,7 @@ def _collected(shared: Shared) -> TrajectoryDataset:
         shared.workers,
         settings.behaviour,
         shared.env,
+        settings={"steps": settings.steps} if settings.steps else None,
     )
 
 

@@ -25,7 +25,9 @@ from wpt_agents.zoo.judge import evaluation
 from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
 from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
 from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.presets import load_preset
 from wpt_agents.zoo.plan.runs import make_plan
+from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
@@ -169,6 +171,16 @@ def test_a_change_of_fine_tuning_keeps_the_pretrained_model_and_others_do_not(tm
     assert job(tmp_path, pretrain={"steps": 3}).shared.model_path != before.model_path
     assert job(tmp_path, collect={"episodes": 5}).shared.model_path != before.model_path
     assert job(tmp_path, env={"rendering": "near"}).shared.data_path != before.data_path
+
+
+def test_a_preset_sets_the_steps_of_explore_state_and_without_them_data_keep_their_name(tmp_path):
+    explore = ["collect.behaviour=explore-state", "collect.tasks=[dmc-cartpole-balance]"]
+    usual = Shared(load_preset("dmc", "debug", explore), "dmc", tmp_path, workers=1)
+    fewer = Shared(load_preset("dmc", "debug", [*explore, "collect.steps=20"]), "dmc", tmp_path, 1)
+    label = json.loads((collect_data(fewer).path / "collect.json").read_text())
+    assert label["settings"] == {"steps": 20}
+    assert fewer.data_path != usual.data_path
+    assert "steps" not in usual.preset.as_dict()["collect"]
 
 
 def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):

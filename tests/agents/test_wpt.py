@@ -532,9 +532,11 @@ def test_an_average_that_is_switched_off_acts_no_longer(tmp_path):
     model = agent(ClockEnv(length=7), **settings).learn(14)
     model.save(tmp_path / "model.zip")
     loaded = WPT.load(tmp_path / "model.zip", actor_average=0.0)
+    other = agent(ClockEnv(length=7))
+    other.set_parameters(model.get_parameters())
     assert model.policy.acting_actor is not model.policy.actor
     model.actor_average = 0.0
-    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded))
+    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded, other))
 
 
 @pytest.mark.parametrize(("number", "states"), [(None, 24), (3, 3)])

@@ -180,6 +180,15 @@ def test_attributes_that_are_set_on_a_vec_env_reach_its_environments():
     assert sorted(len(t) for t in model.replay_buffer.trajectories) == [3, 3, 7]
 
 
+def test_attributes_that_are_set_reach_the_environment_below_all_wrappers():
+    env = ClockEnv()
+    env._private = 1
+    vec_env = agent(env).get_env()
+    for name in ("length", "_private"):
+        vec_env.set_attr(name, 3)
+        assert getattr(env, name) == vec_env.get_attr(name)[0] == 3
+
+
 @pytest.mark.parametrize(
     "make", [ClockEnv, lambda: gym.make_vec("Clock-v0", 2), lambda: VecMonitor(clocks(2))]
 )

@@ -200,6 +200,21 @@ def test_after_an_evaluation_on_its_own_environment_new_episodes_begin(make, clo
     assert len(episodes) >= 3 and all(on_time(t) for t in episodes)
 
 
+@pytest.mark.filterwarnings("ignore:Evaluation environment")
+def test_an_evaluation_by_a_callback_on_the_same_environment_mixes_no_episodes():
+    model = agent(ClockEnv())
+    callback = EvalCallback(model.get_env(), n_eval_episodes=1, eval_freq=10, verbose=0)
+    model.learn(28, callback=callback)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_options_for_the_next_reset_end_no_episode():
+    model = agent(ClockEnv()).learn(8)
+    model.get_env().set_options({"level": 2})
+    model.learn(6, reset_num_timesteps=False)
+    assert [len(t) for t in model.replay_buffer.trajectories] == [7, 7]
+
+
 @pytest.mark.parametrize("bounds", [(-0.3, 0.7), (0.0, 10.0), (-1.0, 1.0)])
 def test_actions_are_scaled_to_the_bounds_of_the_environment(bounds):
     env = ClockEnv(low=bounds[0], high=bounds[1])  # it asserts that its space holds each action

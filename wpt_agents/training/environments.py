@@ -217,9 +217,9 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
 def last_reset(env: VecEnv) -> object:
     """Return what is another object after each call of `reset`, whoever calls it.
 
-    Every VecEnv of SB3 makes new options then; one that does not is taken to be untouched.
+    Every VecEnv of SB3 forgets its seeds then; one that does not is taken to be untouched.
     """
-    return getattr(innermost(env), "_options", None)
+    return getattr(innermost(env), "_seeds", None)
 
 
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:

@@ -182,8 +182,8 @@ class PixelAgent(SavedAgent):
         :return: False if a callback asked to stop
         """
         assert self.env is not None
-        rollout = self._open_rollout()
         callback.on_rollout_start()
+        rollout = self._open_rollout()
         go_on = True
         ended = False
         while go_on and not ended and self.unfinished:
@@ -201,6 +201,7 @@ class PixelAgent(SavedAgent):
             finished = rollout.end_step(rewards, dones, last)
             self._store(finished, int(full.sum()))  # before the callback, which may save the replay
             callback.update_locals(locals())
+            self._reset_seen = last_reset(self.env)  # a step may reset all, with some VecEnvs
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             self._log_episodes(log_interval, len(finished))

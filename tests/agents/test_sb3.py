@@ -180,6 +180,15 @@ def test_attributes_that_are_set_on_a_vec_env_reach_its_environments():
     assert sorted(len(t) for t in model.replay_buffer.trajectories) == [3, 3, 7]
 
 
+def test_attributes_that_are_set_reach_the_environment_below_all_wrappers():
+    env = ClockEnv()
+    env._private = 1
+    vec_env = agent(env).get_env()
+    for name in ("length", "_private"):
+        vec_env.set_attr(name, 3)
+        assert getattr(env, name) == vec_env.get_attr(name)[0] == 3
+
+
 @pytest.mark.parametrize(
     "make", [ClockEnv, lambda: gym.make_vec("Clock-v0", 2), lambda: VecMonitor(clocks(2))]
 )
@@ -189,6 +198,21 @@ def test_after_an_evaluation_on_its_own_environment_new_episodes_begin(make, clo
     model.learn(28, reset_num_timesteps=False)
     episodes = model.replay_buffer.trajectories
     assert len(episodes) >= 3 and all(on_time(t) for t in episodes)
+
+
+@pytest.mark.filterwarnings("ignore:Evaluation environment")
+def test_an_evaluation_by_a_callback_on_the_same_environment_mixes_no_episodes():
+    model = agent(ClockEnv())
+    callback = EvalCallback(model.get_env(), n_eval_episodes=1, eval_freq=10, verbose=0)
+    model.learn(28, callback=callback)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 3
+
+
+def test_options_for_the_next_reset_end_no_episode():
+    model = agent(ClockEnv()).learn(8)
+    model.get_env().set_options({"level": 2})
+    model.learn(6, reset_num_timesteps=False)
+    assert [len(t) for t in model.replay_buffer.trajectories] == [7, 7]
 
 
 @pytest.mark.parametrize("bounds", [(-0.3, 0.7), (0.0, 10.0), (-1.0, 1.0)])

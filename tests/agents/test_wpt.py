@@ -532,9 +532,11 @@ def test_an_average_that_is_switched_off_acts_no_longer(tmp_path):
     model = agent(ClockEnv(length=7), **settings).learn(14)
     model.save(tmp_path / "model.zip")
     loaded = WPT.load(tmp_path / "model.zip", actor_average=0.0)
+    other = agent(ClockEnv(length=7))
+    other.set_parameters(model.get_parameters())
     assert model.policy.acting_actor is not model.policy.actor
     model.actor_average = 0.0
-    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded))
+    assert all(one.policy.acting_actor is one.policy.actor for one in (model, loaded, other))
 
 
 @pytest.mark.parametrize(("number", "states"), [(None, 24), (3, 3)])
@@ -745,13 +747,13 @@ def test_the_nearest_of_dataset_and_earlier_episodes_are_retrieved(store):
     assert model.retrieved_ids == [6]  # it begins exactly as the task does
 
 
-@pytest.mark.parametrize("actions", [2, 3])
-def test_another_task_of_a_sequence_is_drawn_by_the_seed_and_keeps_the_world_model(store, actions):
+@pytest.mark.parametrize("begin, actions", [("next_task", 2), ("next_task", 3), ("set_env", 3)])
+def test_another_task_is_drawn_by_the_seed_and_keeps_the_world_model(store, begin, actions):
     models = [pretrained(store, env=DotEnv()).learn(LENGTH) for _ in range(2)]
     before = weights(models[0])
     for number, model in enumerate(models):
         torch.manual_seed(number)  # torch's own generator must not matter
-        model.next_task(DotEnv(actions=actions))
+        getattr(model, begin)(DotEnv(actions=actions))
     one, other = (weights(model) for model in models)
     assert same(one, other)
     assert not same(

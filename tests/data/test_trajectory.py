@@ -111,8 +111,10 @@ def test_a_wrong_trajectory_is_refused(arguments, culprit):
 
 
 def test_labels_become_text():
-    labelled = Trajectory(IMAGE, ACTION, task=np.int64(3), source=Path("a", "b.h5"))
-    assert (labelled.embodiment, labelled.task, labelled.source) == (None, "3", "a/b.h5")
+    path = Path("a", "b.h5")
+    labelled = Trajectory(IMAGE, ACTION, embodiment=b"arm", task=np.int64(3), source=path)
+    assert (labelled.embodiment, labelled.task, labelled.source) == ("arm", "3", str(path))
+    assert Trajectory(IMAGE, ACTION).task is None
 
 
 def test_it_is_shown_without_its_pixels():

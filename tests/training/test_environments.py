@@ -99,6 +99,14 @@ def test_options_of_a_reset_reach_the_environments_of_a_vector_once():
         env.reset()
 
 
+def test_a_vector_whose_reset_takes_no_options_is_not_handed_any():
+    class Plain(SyncVectorEnv):
+        def reset(self, *, seed=None):
+            return super().reset(seed=seed)
+
+    assert as_vec_env(Plain([ClockEnv])).reset().shape == (1, 64, 64, 3)
+
+
 class Own(VectorEnv):
     """A vector environment of two clocks that are stepped in its own code."""
 

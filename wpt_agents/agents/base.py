@@ -151,6 +151,7 @@ class PixelAgent(SavedAgent):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._reset_seen = last_reset(self.env)
         if self.verbose:
             print(self)
         made = self.updates
@@ -166,7 +167,6 @@ class PixelAgent(SavedAgent):
             self._last_obs = None  # open episodes may lack a step: the next call begins new ones
             raise
         finally:
-            self._reset_seen = last_reset(self.env)
             callback.on_training_end()
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
         outlook.warn(over=True, learns=continued or self.updates > made)
@@ -182,8 +182,8 @@ class PixelAgent(SavedAgent):
         :return: False if a callback asked to stop
         """
         assert self.env is not None
-        rollout = self._open_rollout()
         callback.on_rollout_start()
+        rollout = self._open_rollout()
         go_on = True
         ended = False
         while go_on and not ended and self.unfinished:
@@ -201,12 +201,14 @@ class PixelAgent(SavedAgent):
             finished = rollout.end_step(rewards, dones, last)
             self._store(finished, int(full.sum()))  # before the callback, which may save the replay
             callback.update_locals(locals())
+            self._reset_seen = last_reset(self.env)  # a step may reset all, with some VecEnvs
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             self._log_episodes(log_interval, len(finished))
             self._last_obs = new_obs
             self._last_episode_starts = dones
-            ended = bool(finished)
+            # A callback may have played other episodes on the environment.
+            ended = bool(finished) or last_reset(self.env) is not self._reset_seen
         if go_on:
             callback.on_rollout_end()
         return go_on
@@ -221,16 +223,25 @@ class PixelAgent(SavedAgent):
         if self.rollout is not None and not self._last_episode_starts.all():
             opening = self.rollout.first_image(0)
             return image[:1] if opening is None else opening[None]
-        assert self.env is not None
         images = [image]
         while number > len(images) * self.n_envs:
-            self._last_obs = self.env.reset()
+            self.begin_episodes()
             images.append(np.asarray(to_images(self._last_obs)[0]))
         together: np.ndarray = np.concatenate(images)
         return together[:number]
 
+    def begin_episodes(self) -> None:
+        """Reset all environments; the open episodes are dropped."""
+        assert self.env is not None
+        self._last_obs = self.env.reset()
+        self._last_episode_starts = np.ones(self.n_envs, bool)
+        self._reset_seen = last_reset(self.env)
+
     def _open_rollout(self) -> Rollout:
         """Return the open episodes; new ones if all environments were just reset."""
+        assert self.env is not None
+        if last_reset(self.env) is not self._reset_seen:
+            self.begin_episodes()
         if self.rollout is None or self._last_episode_starts.all():
             self.rollout = Rollout(
                 self.policy,

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
@@ -189,9 +188,7 @@ class Explorer(WPT):
         )
         while self.episodes < episodes:
             self.env.seed(self.streams.integer(Purpose.RESET, self.episodes))
-            self._last_obs = self.env.reset()
-            self._last_episode_starts = np.ones(1, bool)
-            self.rollout = None  # no half-played episode
+            self.begin_episodes()
             with self.operations():
                 self.collect(callback, 0)
                 self.episodes += self.progress.cut  # the environment is reset here, too

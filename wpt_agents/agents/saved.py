@@ -196,7 +196,6 @@ class SavedAgent(KeywordAgent):
         assert isinstance(env.action_space, spaces.Box)
         other = env.action_space.shape != self.action_space.shape
         self.env = env
-        self._reset_seen = last_reset(env)
         self.n_envs = env.num_envs
         self._vec_normalize_env = unwrap_vec_normalize(env)
         self.observation_space = env.observation_space
@@ -212,6 +211,7 @@ class SavedAgent(KeywordAgent):
         self.check_units()
         if self.hyperparameters.seed is not None:
             env.seed(self.hyperparameters.seed)
+        self._reset_seen = last_reset(env)
 
     # Model files and copies
 

@@ -164,6 +164,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         super().set_parameters(*args, **kwargs)
         self.progress.initialised = True
+        self.choose_who_acts()
 
     def choose_who_acts(self) -> None:
         """Let the clone (`ibrl`, `residual`) and the average actor act where keywords say so.
@@ -227,7 +228,8 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def on_other_actions(self) -> None:
         """Begin a new task if one was begun: its episodes and behaviour have another width."""
         if self.begun:
-            self.reset_task()
+            with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
+                self.reset_task()
 
     @property
     def begun(self) -> bool:

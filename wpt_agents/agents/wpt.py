@@ -350,7 +350,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         checked = self._checked(env)
         with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
             self.reset_task(keep_data=self.dataset is not None)
-            self._use_env(checked)  # draws again where actions have another width
+        self._use_env(checked)
         self.progress.restart_steps()
 
     def too_late(self, stage: Stage) -> str | None:

@@ -103,8 +103,9 @@ class Trajectory:
                 )
             object.__setattr__(self, "bounds", bounds)
         for name in ("embodiment", "task", "source"):
-            if (label := getattr(self, name)) is not None:  # a Path, for example
-                object.__setattr__(self, name, str(label))
+            if (label := getattr(self, name)) is not None:  # a Path or bytes, for example
+                label = label.decode() if isinstance(label, bytes) else str(label)
+                object.__setattr__(self, name, label)
         object.__setattr__(self, "terminated", bool(self.terminated))
         object.__setattr__(self, "reward", reward)
 

@@ -150,6 +150,9 @@ def _side_by_side(envs: list[gym.Env]) -> VecEnv:
     return DummyVecEnv(functions)
 
 
+OF_WRAPPERS = vars(gym.Wrapper(gym.Env())).keys()  # what Gymnasium's wrappers keep themselves
+
+
 class OwnObservation(gym.ObservationWrapper):
     """Copies each observation, as some environments draw the next one into the same array.
 
@@ -158,11 +161,11 @@ class OwnObservation(gym.ObservationWrapper):
     """
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set it on the environment, as `set_attr` of a DummyVecEnv does without this wrapper."""
-        if name == "env" or name.startswith("_"):  # what Gymnasium's wrappers keep themselves
+        """Set it where it is defined, so that `set_attr` of a DummyVecEnv has an effect."""
+        if name in OF_WRAPPERS:
             super().__setattr__(name, value)
         else:
-            setattr(self.env, name, value)
+            self.env.set_wrapper_attr(name, value)
 
     def observation(self, observation: Any) -> Any:
         """Return a copy."""
@@ -214,9 +217,9 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
 def last_reset(env: VecEnv) -> object:
     """Return what is another object after each call of `reset`, whoever calls it.
 
-    Every VecEnv of SB3 makes new options then; one that does not is taken to be untouched.
+    Every VecEnv of SB3 forgets its seeds then; one that does not is taken to be untouched.
     """
-    return getattr(innermost(env), "_options", None)
+    return getattr(innermost(env), "_seeds", None)
 
 
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:

@@ -39,9 +39,8 @@ class GymnasiumVecEnv(VecEnv):
         options = self._options[0]
         if any(other != options for other in self._options):
             raise ValueError("A Gymnasium vector takes the same options for all environments")
-        obs, infos = self.vector.reset(
-            seed=None if None in seeds else seeds, options=options or None
-        )
+        chosen = {"options": options} if options else {}  # not every vector takes any
+        obs, infos = self.vector.reset(seed=None if None in seeds else seeds, **chosen)
         self.reset_infos = [_of_one(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()

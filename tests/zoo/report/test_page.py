@@ -288,6 +288,15 @@ def test_the_papers_means_stand_beside_ours_over_the_same_tasks(further):
     assert "0.73 of 1 task" in text(page)  # the paper's
 
 
+def test_a_task_without_a_score_of_the_method_in_the_paper_is_left_out_of_both_means(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", method="drq-v2", returns=(143.0, 143.0))
+    make_run(tmp_path, "metaworld-reach", method="drq-v2", returns=(1.0, 1.0))  # 0.43 in Table 4
+    make_run(tmp_path, "metaworld-door-close", method="drq-v2", returns=(9.0, 9.0))  # a dash
+    [line] = headline.both_suites(read_results(tmp_path))
+    assert line.ours == pytest.approx((0.143 + 0.0) / 2)
+    assert line.paper == pytest.approx((0.143 + 0.43) / 2)
+
+
 def test_a_table_whose_tasks_were_not_run_has_no_mean(tmp_path):
     make_run(tmp_path, "dmc-quadruped-escape")
     write_page(tmp_path, tmp_path / "index.html")

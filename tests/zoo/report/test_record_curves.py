@@ -24,6 +24,12 @@ def scores(points):
     return found_points
 
 
+def test_a_part_of_a_last_step_does_not_stretch_the_frames(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", frames=1001)  # 500 steps of two frames
+    points = record_curves.points_of(find_finished(tmp_path))
+    assert [point.at for point in points] == [200, 600, 1000]
+
+
 def test_points_are_means_in_percent_or_tenths_of_returns(tmp_path):
     # evaluations after 100, 300 and 500 steps of two frames, of 0, 1/2 and 1 times the returns
     make_run(tmp_path, "metaworld-reach", returns=(10.0, 20.0))

@@ -84,7 +84,7 @@ class Finished:
         scores = stored.successes if self.result.metric == "success" else stored.returns
         if scores is None:  # returns would be drawn as success rates
             return None
-        repeat = self.result.frames / self.result.steps
+        repeat = self.result.frames // self.result.steps  # a part of a last step is not played
         return stored.steps * repeat, np.asarray(scores, float)
 
 

@@ -33,7 +33,8 @@ class Line:
     :param score: 0 to 100 as in the paper: the return / 10, or the share of successes x 100
     :param hours: hours of the whole run, including shared stages that it executed
     :param updates: gradient updates of fine-tuning; None where unknown, as in version 0.1
-    :param cpu_hours: CPU hours of fine-tuning; None where unknown
+    :param cpu_hours: CPU hours of fine-tuning by the learner's process; a worker process in which
+        the environment steps, as the model-free agents have, is not counted; None where unknown
     :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
         fine-tuning began with; "" without one, or where unknown
     :param policy: one of `POLICIES`; "" in records of version 0.1

@@ -213,6 +213,15 @@ def test_figures_are_whole_svg_in_the_pages_colours():
     assert colours == {"var(--series-1)", "var(--ink)", "var(--muted)", "var(--line)"}
 
 
+def test_bars_below_zero_are_drawn(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "svg", lambda figure, _: drawn.append(figure))
+    for value in (-0.14, 0.0):
+        figures.bars("a", "y", {"none": (value, None, None)}, [figures.INK])
+    below, zero = (figure.axes[0].get_ylim() for figure in drawn)
+    assert below[0] <= -0.14 and zero == (0, 1)
+
+
 def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
     tasks = ["dmc-walker-run", "dmc-walker-stand"]  # 728.0 and 969.4 in Table 5
     aggregate = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)

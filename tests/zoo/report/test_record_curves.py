@@ -97,6 +97,14 @@ def test_a_panel_shows_the_mean_the_prior_actor_and_the_papers_score(tmp_path, m
     ]
 
 
+def test_negative_returns_of_hard_tasks_are_within_the_panel(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(record_curves.plt, "close", drawn.append)
+    make_run(tmp_path, "dmc-walker-walk-hard", returns=(-140.0, -140.0))
+    record_page.add(tmp_path / "mid.csv", find_finished(tmp_path))
+    assert -24 < drawn[-1].axes[0].get_ylim()[0] < -14
+
+
 def test_runs_without_evaluations_leave_no_file_and_damaged_curves_are_named(tmp_path):
     folder = make_run(tmp_path / "runs", "metaworld-reach")
     (folder / "evaluations.npz").unlink()

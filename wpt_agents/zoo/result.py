@@ -153,11 +153,12 @@ class Result:
     :param steps: calls of `env.step` in fine-tuning; `frames` counts simulator frames
     :param scores: by policy, see `POLICIES`
     :param seconds: wall-clock seconds of each stage
-    :param commit: commit of the code, None outside a checkout
+    :param commit: commit of the code, None outside a checkout; of a resumed run, those of all its
+        processes: "COMMIT, COMMIT"
     :param updates: gradient updates of fine-tuning, None if the agent does not count them
     :param cpu_seconds: processor seconds of the learning process, None in results of version 0.1
     :param model: the first digits of the SHA-256 of the final model file
-    :param pretrained: the same for the pre-trained model, None if there is none
+    :param pretrained: the same for the pre-trained model as the run began, None if there is none
     """
 
     suite: str

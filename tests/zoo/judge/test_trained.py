@@ -20,7 +20,7 @@ from zoo_command import call
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
-from wpt_agents.zoo.judge.diagnosis import promises
+from wpt_agents.zoo.judge.diagnosis import Diagnosis, Promise, promises, show
 from wpt_agents.zoo.judge.trained import Origin, find_trained
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.hub import card, pull, push
@@ -87,6 +87,14 @@ def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):
     assert "new episode, update" not in capsys.readouterr().out  # a file alone has no log
     assert call(monkeypatch, "diagnose", folder, "--horizon", "26") == 2
     assert "shorter --horizon" in capsys.readouterr().err
+
+
+def test_diagnose_says_where_dreams_lack_the_prior_actor(capsys):
+    rows = [Promise(0, 1.0, 1.0, 1.0, 1.0, 1.0)]
+    show(Diagnosis([1.0], 0.1, rows, clone_acts=True), 20)
+    assert "in acting, and not in imagination" in " ".join(capsys.readouterr().out.split())
+    show(Diagnosis([1.0], 0.1, rows), 20)
+    assert "prior actor" not in capsys.readouterr().out.lower()
 
 
 def test_promises_are_of_the_actions_and_rewards_from_the_start_on(monkeypatch):

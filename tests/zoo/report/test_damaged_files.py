@@ -27,6 +27,16 @@ def damage(path, how):
     path.write_bytes(how(path.read_bytes()))
 
 
+@pytest.mark.parametrize("form", [[], ["--markdown"]])
+def test_a_run_that_failed_is_named_beside_the_means(form, runs, tmp_path, monkeypatch, capsys):
+    (runs[1] / "result.json").unlink()
+    (runs[1] / "error.txt").write_text("Traceback\nRuntimeError: [out] of luck\n")
+    assert call(monkeypatch, "report", tmp_path, *form) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Not finished, and in none of these numbers: 1 run: " in printed
+    assert "walker-run_1 (RuntimeError: [out] of luck)" in printed
+
+
 @pytest.fixture
 def runs(tmp_path):
     """Two runs of which the first one will be damaged."""

@@ -213,6 +213,15 @@ def test_figures_are_whole_svg_in_the_pages_colours():
     assert colours == {"var(--series-1)", "var(--ink)", "var(--muted)", "var(--line)"}
 
 
+def test_bars_below_zero_are_drawn(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "svg", lambda figure, _: drawn.append(figure))
+    for value in (-0.14, 0.0):
+        figures.bars("a", "y", {"none": (value, None, None)}, [figures.INK])
+    below, zero = (figure.axes[0].get_ylim() for figure in drawn)
+    assert below[0] <= -0.14 and zero == (0, 1)
+
+
 def test_the_papers_aggregate_is_over_the_tasks_that_were_run():
     tasks = ["dmc-walker-run", "dmc-walker-stand"]  # 728.0 and 969.4 in Table 5
     aggregate = aggregates.paper_aggregate("dmc", tasks, "wpt", 150_000)
@@ -286,6 +295,15 @@ def test_the_papers_means_stand_beside_ours_over_the_same_tasks(further):
     assert mean.startswith(" mean 730 of 1 task ")  # the rows of the table
     assert "debug, 1,000 frames 1 of 22 and 1 not in the paper 2 0.36" in text(page)
     assert "0.73 of 1 task" in text(page)  # the paper's
+
+
+def test_a_task_without_a_score_of_the_method_in_the_paper_is_left_out_of_both_means(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", method="drq-v2", returns=(143.0, 143.0))
+    make_run(tmp_path, "metaworld-reach", method="drq-v2", returns=(1.0, 1.0))  # 0.43 in Table 4
+    make_run(tmp_path, "metaworld-door-close", method="drq-v2", returns=(9.0, 9.0))  # a dash
+    [line] = headline.both_suites(read_results(tmp_path))
+    assert line.ours == pytest.approx((0.143 + 0.0) / 2)
+    assert line.paper == pytest.approx((0.143 + 0.43) / 2)
 
 
 def test_a_table_whose_tasks_were_not_run_has_no_mean(tmp_path):

@@ -1,6 +1,7 @@
 """The record of results: what stands in it, how it grows, what it says together."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from typer.testing import CliRunner
 
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.report import record, record_picture, record_tables
+from wpt_agents.zoo.report import evidence, record, record_picture, record_tables
 from wpt_agents.zoo.report.folders import find_finished
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.report.record_tables import Key
@@ -127,6 +128,37 @@ def test_policies_that_a_run_no_longer_has_are_dropped_when_it_is_recorded_again
         ("prior actor, no-pretrain", 0): 4.0,
         ("wpt, last", 1): 5.0,
     }
+
+
+def test_a_score_of_another_commit_or_model_is_not_replaced_silently(tmp_path):
+    path = tmp_path / "small.csv"
+    first = [replace(line("wpt", 1.0), return_=10.0, model_hash="m1"), line("wpt", 2.0, seed=1)]
+    record.update(path, first)
+    record.update(path, [replace(first[0], commit="d"), replace(first[1], return_=20.0)])
+    other = replace(first[0], score=3.0, return_=30.0, model_hash="m2", commit="d")
+    with pytest.warns(
+        UserWarning,
+        match=r"small.csv now has other scores: dmc-a, wpt, seed 0: 1 of commit d and model m1 "
+        r"by 3 of commit d and model m2$",
+    ):
+        record.update(path, [other])
+
+
+def test_rows_whose_seeds_began_with_different_models_are_named():
+    lines = [replace(line("wpt", 1.0), model_hash="m1"), line("wpt", 2.0, seed=1)]
+    lines += [replace(line("wpt", 3.0, seed=2), model_hash="m1"), line("scratch", 1.0)]
+    page = record_tables.markdown(lines)
+    assert "\n- dmc-a, wpt, tiny, 100 frames: m1 (seed 0, 2); unknown (seed 1)\n" in page
+    assert "pre-trained models" not in record_tables.markdown(lines[::2])
+
+
+def test_budgets_that_are_almost_equal_do_not_share_a_column():
+    budgets = {100_000: 1.0, 300_000: 2.0, 300_400: 3.0}
+    lines = [line("scratch", score, frames=frames) for frames, score in budgets.items()]
+    names = ["scratch", "scratch, 3x frames", "scratch, 300,400 frames"]
+    assert list(record_tables.by_suite(lines)) == names
+    [one] = evidence.evidence(lines)
+    assert [scores["dmc-a"][0] for scores in one.scores.values()] == [1.0, 2.0, 3.0]
 
 
 def test_a_run_is_recorded_once_however_its_settings_were_written(tmp_path):

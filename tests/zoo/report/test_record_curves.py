@@ -24,6 +24,12 @@ def scores(points):
     return found_points
 
 
+def test_a_part_of_a_last_step_does_not_stretch_the_frames(tmp_path):
+    make_run(tmp_path, "dmc-walker-run", frames=1001)  # 500 steps of two frames
+    points = record_curves.points_of(find_finished(tmp_path))
+    assert [point.at for point in points] == [200, 600, 1000]
+
+
 def test_points_are_means_in_percent_or_tenths_of_returns(tmp_path):
     # evaluations after 100, 300 and 500 steps of two frames, of 0, 1/2 and 1 times the returns
     make_run(tmp_path, "metaworld-reach", returns=(10.0, 20.0))
@@ -89,6 +95,14 @@ def test_a_panel_shows_the_mean_the_prior_actor_and_the_papers_score(tmp_path, m
     assert panel.get_title() == "drawer-open" and list(panel.get_lines()[0].get_xdata()) == [
         *(0.2, 0.6, 1.0)
     ]
+
+
+def test_negative_returns_of_hard_tasks_are_within_the_panel(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(record_curves.plt, "close", drawn.append)
+    make_run(tmp_path, "dmc-walker-walk-hard", returns=(-140.0, -140.0))
+    record_page.add(tmp_path / "mid.csv", find_finished(tmp_path))
+    assert -24 < drawn[-1].axes[0].get_ylim()[0] < -14
 
 
 def test_runs_without_evaluations_leave_no_file_and_damaged_curves_are_named(tmp_path):

@@ -210,6 +210,18 @@ def test_rows_leave_out_changed_settings_and_show_the_papers_score_hollow():
     ]
 
 
+def test_negative_scores_of_hard_tasks_are_within_the_picture():
+    hard = [line("random", "walker-walk-hard", -14.0, frames=0, suite="dmc")]
+    hard += [line("wpt", "walker-walk-hard", 88.0, suite="dmc")]
+    for figure in (
+        record_picture.draw_rows(evidence.evidence(hard)),
+        record_picture.draw_panels(hard),
+    ):
+        (panel,) = figure.axes
+        assert -24 < panel.get_xlim()[0] < -14 and panel.get_xlim()[1] < 105
+    assert record_picture.draw_panels(LINES).axes[0].get_xlim()[0] == -4
+
+
 def test_policies_in_between_are_not_drawn_in_rows_at_any_budget():
     names = ["wpt, last", "wpt, last, 3x frames", "wpt+, after head start, 3x frames", "nothing"]
     assert not any(map(record_picture.drawn, names))

@@ -21,8 +21,10 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_model
 from wpt_agents.training.learner import Learner
 from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
+from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.run import learning, locks, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
+from wpt_agents.zoo.run.evaluating import file_hash
 from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.run.runner import run
@@ -116,6 +118,37 @@ def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch,
     killed_at(60, monkeypatch, one)
     run(one)
     assert "continued at 100 of 150 frames, 75 steps" in capsys.readouterr().out
+
+
+def test_a_resumed_run_names_the_commits_the_model_and_the_time_of_all_its_processes(
+    tmp_path, monkeypatch
+):
+    one = job(tmp_path, **CHANGES)
+    monkeypatch.setattr(runner, "commit", lambda: "aaa")
+    killed_at(60, monkeypatch, one)
+    model = pretrain(one.shared, collect_data(one.shared))
+    began_with = file_hash(model)
+    model.write_bytes(b"trained again by another command")
+    state = one.folder / "checkpoints" / "step-000000050" / "state.json"
+    stored = json.loads(state.read_text())
+    assert {"collect", "pretrain", "index"} <= stored["origin"]["seconds"].keys()
+    stored["origin"]["seconds"]["index"] = 5.0
+    state.write_text(json.dumps(stored))
+    monkeypatch.setattr(runner, "commit", lambda: "bbb")
+    killed_at(90, monkeypatch, one)
+    done = run(one)
+    assert (done.commit, done.pretrained) == ("aaa, bbb", began_with)
+    assert done.seconds["index"] == 5.0  # it is not made again
+
+
+def test_a_checkpoint_of_an_earlier_version_has_no_origin(tmp_path, monkeypatch):
+    one = job(tmp_path, "scratch", **CHANGES)
+    killed_at(60, monkeypatch, one)
+    state = one.folder / "checkpoints" / "step-000000050" / "state.json"
+    stored = json.loads(state.read_text())
+    del stored["origin"]
+    state.write_text(json.dumps(stored))
+    assert run(one).commit == commit()
 
 
 def test_a_run_killed_after_learning_learns_no_more(tmp_path, monkeypatch):

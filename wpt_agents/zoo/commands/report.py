@@ -56,7 +56,7 @@ def report(
         sequence_markdown,
         sequence_table,
     )
-    from wpt_agents.zoo.report.folders import find_finished
+    from wpt_agents.zoo.report.folders import find_finished, find_unfinished, unfinished_text
     from wpt_agents.zoo.report.page import check_media, write_page
     from wpt_agents.zoo.report.steadiness import markdown as steadiness_markdown
     from wpt_agents.zoo.report.steadiness import steadiness
@@ -80,7 +80,8 @@ def report(
     rows = tables.summarise(results)
     policies = tables.policies(results)
     parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
-    parts += [steadiness_markdown(steadiness(runs)), sequence_markdown(sequences)]
+    missing = unfinished_text(find_unfinished(folder))
+    parts += [steadiness_markdown(steadiness(runs)), sequence_markdown(sequences), missing]
     as_markdown = "\n".join(filter(None, parts))
     if record is not None and results:
         record_page.add(record, runs)
@@ -96,6 +97,8 @@ def report(
             console.print(tables.summary_table(rows))
         if sequences:
             console.print(sequence_table(sequences))
+        if missing:
+            console.print(missing, markup=False)
         where = escape(str(page.resolve()))
         console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")
 

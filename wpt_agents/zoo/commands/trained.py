@@ -161,7 +161,9 @@ def judge_predictions(
 ) -> None:
     """Measure how well a world model predicts: its error at each horizon, beside simple baselines.
 
-    The model sees five images of an episode, and predicts the others from the actions alone.
+    The model sees five images of an episode, and predicts the others from the actions alone. The
+    baselines repeat the last image, or show the mean of all images of the tested episodes, which a
+    prediction could not know.
 
     Example: `python -m wpt_agents.zoo open-loop walker.zip data/unseen --out predictions`
     """

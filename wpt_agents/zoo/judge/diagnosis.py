@@ -102,11 +102,14 @@ class Diagnosis:
     :param returns: the return of each episode
     :param reward_error: mean absolute error of the reward head per step, on filtered states
     :param promises: a row for each starting step, means over episodes
+    :param clone_acts: whether the prior actor takes part in acting (`residual`, `ibrl`), which it
+        cannot in imagination
     """
 
     returns: list[float]
     reward_error: float
     promises: list[Promise]
+    clone_acts: bool = False
 
 
 def diagnose(
@@ -134,7 +137,7 @@ def diagnose(
             errors.append(model.policy.heldout_errors(played, len(played) + 1)["reward"])
             promised.append(promises(model.policy, played, model.gamma, starts, horizon))
     means = [Promise(*np.mean([astuple(p) for p in row], 0)) for row in zip(*promised, strict=True)]
-    return Diagnosis(returns, float(np.mean(errors)), means)
+    return Diagnosis(returns, float(np.mean(errors)), means, model.policy.sees_frames)
 
 
 def show(diagnosis: Diagnosis, horizon: int) -> None:
@@ -148,6 +151,11 @@ def show(diagnosis: Diagnosis, horizon: int) -> None:
     for row in diagnosis.promises:
         table.add_row(f"{row.start:.0f}", *(f"{x:.2f}" for x in astuple(row)[1:]))
     console.print(table)
+    if diagnosis.clone_acts:
+        console.print(
+            'The prior actor takes part in acting, and not in imagination: "the actor\'s" are the '
+            "actions of the actor alone, which are not those that are executed."
+        )
     console.print(f"Returns: {', '.join(f'{x:.0f}' for x in diagnosis.returns)}")
     console.print(
         f"Error of the reward head on these images: {diagnosis.reward_error:.2f} per step"

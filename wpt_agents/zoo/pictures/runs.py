@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from wpt_agents.zoo.pictures.predictions import ahead
-from wpt_agents.zoo.result import NOTHING, PRIOR_ACTOR, RANDOM, Score, final_policy
+from wpt_agents.zoo.result import LAST, NOTHING, PRIOR_ACTOR, RANDOM, Score, final_policy
 
 INK = "#1f2933"
 MUTED = "#8a94a0"
@@ -50,7 +50,8 @@ def learning_curve(
         axes.plot(at, episodes.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
     for name, score in scores.items():
         if name == final_policy(scores):
-            _final_point(axes, max(frames, default=0), score)
+            whose = "the agent at the end" if name == LAST else "the best of the evaluated agents"
+            _final_point(axes, max(frames, default=0), score, whose)
         else:
             mean = score.mean
             axes.axhline(mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
@@ -64,12 +65,12 @@ def learning_curve(
     plt.close(figure)
 
 
-def _final_point(axes: Axes, at: float, score: Score) -> None:
-    """Draw the score at the end with its 95 % interval."""
+def _final_point(axes: Axes, at: float, score: Score, whose: str) -> None:
+    """Draw the score of the final policy with its 95 % interval, at the end of the run."""
     mean, low, high = score.interval
     bar = [[mean - low], [high - mean]] if low is not None and high is not None else None
     style: dict[str, Any] = {"fmt": "D", "color": AGENT, "mec": "white", "ms": 9}
-    label = f"the agent at the end, {mean:.0f}"
+    label = f"{whose}, {mean:.0f}"
     axes.errorbar([at], [mean], bar, label=label, capsize=4, zorder=3, **style)
 
 

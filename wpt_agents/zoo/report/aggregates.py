@@ -84,9 +84,16 @@ def references() -> tuple[Reference, ...]:
     return tuple(references)
 
 
-def paper_tasks(suite: str) -> set[str]:
-    """Return the tasks of a suite for which the paper has scores."""
-    return {r.task for r in references() if r.suite == suite and r.task not in STATISTICS}
+def paper_tasks(suite: str, method: str = "") -> set[str]:
+    """Return the tasks of a suite for which the paper has scores: of a method, "" for any."""
+    return {
+        row.task
+        for row in references()
+        if row.suite == suite
+        and row.task not in STATISTICS
+        and method in ("", row.method)
+        and row.score is not None
+    }
 
 
 def normalised(score: float, metric: str) -> float:

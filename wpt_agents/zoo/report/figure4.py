@@ -185,7 +185,7 @@ def _curve(result: SequenceResult, task: str, folder: Path) -> tuple[np.ndarray,
 
     :raises ValueError: if the file is damaged
     """
-    repeat = result.frames / result.steps
+    repeat = result.frames // result.steps
     evaluated = Evaluations.read(folder / task / EVALUATIONS)
     if evaluated is not None:
         return evaluated.steps * repeat, np.asarray(evaluated.returns, float)

@@ -137,7 +137,7 @@ def bars(
         axes.set_xticks(range(len(series)), texts)
         axes.set_title(title, wrap=True)
         axes.set(ylabel=y_label)
-        if not any(max(value, high or 0) > 0 for value, _, high in series.values()):
+        if not any(value or high for value, _, high in series.values()):
             axes.set_ylim(0, 1)  # avoid an axis around 0, which would look like an error
         axes.grid(False, axis="x")
         return svg(figure, title)

@@ -3,7 +3,7 @@
 import base64
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import imageio.v3 as imageio
 import numpy as np
 
+from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, Evaluations, damaged
 from wpt_agents.zoo.report.aggregates import Experiment
 from wpt_agents.zoo.result import FILE, Result, read_result
@@ -83,7 +84,7 @@ class Finished:
         scores = stored.successes if self.result.metric == "success" else stored.returns
         if scores is None:  # returns would be drawn as success rates
             return None
-        repeat = self.result.frames / self.result.steps
+        repeat = self.result.frames // self.result.steps  # a part of a last step is not played
         return stored.steps * repeat, np.asarray(scores, float)
 
 
@@ -160,6 +161,15 @@ def find_unfinished(folder: Path) -> list[Unfinished]:
     folders = [path.parent for path in sorted(folder.glob("**/config.yaml"))]
     errors = ((path, _error(path)) for path in folders)
     return [Unfinished(path, error) for path, error in errors if error is not None]
+
+
+def unfinished_text(unfinished: Sequence[Unfinished]) -> str:
+    """Return a paragraph that names unfinished and failed runs, "" without any."""
+    if not unfinished:
+        return ""
+    names = "; ".join(f"{one.folder} ({one.last_line})" for one in unfinished)
+    count = counted(len(unfinished), "run")
+    return f"Not finished, and in none of these numbers: {count}: {names}\n"
 
 
 def _error(folder: Path) -> str | None:

@@ -102,12 +102,12 @@ class BothSuites:
 def both_suites(results: Sequence[Result]) -> list[BothSuites]:
     """Return the paper's aggregate for each preset and method that has runs of both suites.
 
-    Tasks that are not in the paper do not count.
+    Tasks without a score in the paper do not count: of the method, or of any if it has none there.
     """
     runs: dict[tuple[str, Variant], dict[str, Mapping[str, list[float]]]] = defaultdict(dict)
     every = aggregates.by_experiment(results).items()
     for one, tasks in sorted(every, key=_largest_budget_first):  # keeps the smallest budget
-        printed = aggregates.paper_tasks(one.suite)
+        printed = aggregates.paper_tasks(one.suite, one.method) or aggregates.paper_tasks(one.suite)
         if common := {task: scores for task, scores in tasks.items() if task in printed}:
             runs[one.method, one.variant][one.suite] = common
     means = []

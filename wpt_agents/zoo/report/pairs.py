@@ -162,5 +162,8 @@ def markdown(lines: Sequence[Line]) -> str:
         note += f' "With a gap" are the tasks {GAP}.'
     if kinds - {"", ", with a gap"}:
         below = f"{PRIOR_ACTOR.capitalize()} below {ROOM:.0f}"
-        note += f' "{below}" are the tasks on which its score is lower.'
+        note += (
+            f' "{below}" are the tasks on which its score is lower. The same episodes choose these '
+            "tasks and are compared, so chance makes the prior actor look worse there than it is."
+        )
     return f"## Pairs\n\n{note}\n\n{markdown_table(HEADINGS, [pair.cells for pair in compared])}"

@@ -7,6 +7,7 @@ longer has.
 
 import csv
 import io
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -32,7 +33,8 @@ class Line:
     :param score: 0 to 100 as in the paper: the return / 10, or the share of successes x 100
     :param hours: hours of the whole run, including shared stages that it executed
     :param updates: gradient updates of fine-tuning; None where unknown, as in version 0.1
-    :param cpu_hours: CPU hours of fine-tuning; None where unknown
+    :param cpu_hours: CPU hours of fine-tuning by the learner's process; a worker process in which
+        the environment steps, as the model-free agents have, is not counted; None where unknown
     :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
         fine-tuning began with; "" without one, or where unknown
     :param policy: one of `POLICIES`; "" in records of version 0.1
@@ -137,7 +139,9 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
     """
     lines = list(lines)
     again = {line.agent for line in lines}
-    before = [line for line in read(path) if line.agent not in again] if path.exists() else []
+    known = read(path) if path.exists() else []
+    before = [line for line in known if line.agent not in again]
+    warn_of_replaced(path, known, lines)
     every = sorted({line.run: line for line in [*before, *lines]}.values(), key=order)
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -147,6 +151,27 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
     with replacing(path) as temporary:
         temporary.write_text(file.getvalue(), encoding="utf-8")
     return every
+
+
+def warn_of_replaced(path: Path, known: Iterable[Line], lines: Iterable[Line]) -> None:
+    """Warn of lines whose score is replaced by that of another commit or pre-trained model."""
+    old = {line.run: line for line in known}
+    changes = [
+        f"{line.task}, {line.method}, seed {line.seed}: {old[line.run].score:g} of "
+        f"{made_with(old[line.run])} by {line.score:g} of {made_with(line)}"
+        for line in lines
+        if line.frames
+        and line.run in old
+        and made_with(line) != made_with(old[line.run])
+        and line.return_ != old[line.run].return_
+    ]
+    if changes:
+        warnings.warn(f"{path} now has other scores: {'; '.join(changes)}", stacklevel=2)
+
+
+def made_with(line: Line) -> str:
+    """Return the commit of a line, with its pre-trained model if it has one."""
+    return f"commit {line.commit}" + (f" and model {line.model_hash}" if line.model_hash else "")
 
 
 def read(path: Path) -> list[Line]:

@@ -9,6 +9,7 @@ import io
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import Path
 
 import matplotlib
@@ -24,7 +25,7 @@ from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.record import Identity, Line, place
-from wpt_agents.zoo.report.record_picture import PAPER_NAME, STYLES, Style, styles_of
+from wpt_agents.zoo.report.record_picture import PAPER_NAME, STYLES, Style, least, styles_of
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
 
 COLUMNS = 5  # panels in a row
@@ -176,7 +177,9 @@ def _draw_panel(
         panel.axhline(mean, color=STYLES[PRIOR_ACTOR].colour, ls="--", lw=1, label=PRIOR_ACTOR)
     if (paper := one.paper["wpt"].get(task)) is not None:
         panel.axhline(paper, color="black", ls=":", lw=1, label=PAPER_NAME.replace("\n", " "))
-    panel.set(ylim=(-4, 104), title=task.removeprefix(f"{one.suite}-"))
+    seeds_of = [scores for seeds in curves.values() for scores in seeds.values()]
+    bottom = least(chain((prior or {}).values(), *seeds_of), -4)
+    panel.set(ylim=(bottom, 104), title=task.removeprefix(f"{one.suite}-"))
     panel.title.set_fontsize(8)
     panel.tick_params(labelsize=7)
     panel.grid(lw=0.4)

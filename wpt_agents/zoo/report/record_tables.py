@@ -83,9 +83,14 @@ def by_suite(lines: Sequence[Line]) -> dict[str, dict[str, Means]]:
 
 
 def column(line: Line, frames: int, preset: Variant) -> str:
-    """Return the method with unusual settings of its run: "scratch, 3x frames"."""
-    ratio = line.frames / frames
-    name = line.method if ratio in (0, 1) else f"{line.method}, {ratio:.3g}x frames"
+    """Return the method with unusual settings of its run: "scratch, 3x frames".
+
+    A budget that this would round has its own number of frames, so that two do not share a column.
+    """
+    ratio = f"{line.frames / frames:.3g}"
+    exact = round(float(ratio) * frames) == line.frames
+    budget = f"{ratio}x frames" if exact else f"{line.frames:,} frames"
+    name = line.method if line.frames in (0, frames) else f"{line.method}, {budget}"
     same = line.preset == (preset if line.frames else preset.playing)
     return name if same else f"{name}, {line.preset}"
 
@@ -140,10 +145,29 @@ TASK_NOTE = (
     "Scores are from 0 to 100. In brackets is the 95 % interval over seeds by Student's t, from "
     "three seeds on; an end marked * is cut off at the limit of a success rate."
 )
+MIXED_NOTE = (
+    "**The seeds of these rows began with different or unknown pre-trained models**, so their mean "
+    "and their spread are not those of seeds alone. The first digits of the SHA-256 of each model:"
+)
 SUITE_NOTE = (
     "In brackets is the 95 % interval by a bootstrap over the seeds within each task. It needs two "
     "seeds of every task, or three if there is a single task."
 )
+
+
+def mixed_models(lines: Iterable[Line]) -> str:
+    """Return a paragraph about rows whose seeds began with different models, "" without any."""
+    models: dict[tuple[str, Key], dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+    for line in lines:
+        row = line.task, Key(line.method, line.preset, line.frames)
+        models[row][line.model_hash or "unknown"].append(line.seed)
+    items = [
+        f"- {task}, {key.method}, {key.preset}, {key.frames:,} frames: "
+        + "; ".join(f"{model} (seed {', '.join(map(str, seeds))})" for model, seeds in used.items())
+        for (task, key), used in models.items()
+        if len(used) > 1
+    ]
+    return f"{MIXED_NOTE}\n\n" + "\n".join(items) + "\n\n" if items else ""
 
 
 def markdown(lines: Sequence[Line]) -> str:
@@ -158,12 +182,13 @@ def markdown(lines: Sequence[Line]) -> str:
             seeds = " ".join(map(number, cell.scores))
             mean_return = float(np.mean(earned[task, key]))
             rows.append([*names, str(cell), seeds, number(mean_return)])
+    mixed = mixed_models(lines)
     suites = [
         [suite, method, str(tasks), str(len(cell.scores)), str(cell)]
         for method, means in by_suite(lines).items()
         for suite, (tasks, cell) in means.items()
     ]
     return (
-        f"## Every run\n\n{TASK_NOTE}\n\n{markdown_table(TASK_HEADINGS, rows)}\n"
+        f"## Every run\n\n{TASK_NOTE}\n\n{markdown_table(TASK_HEADINGS, rows)}\n{mixed}"
         f"## Means over tasks\n\n{SUITE_NOTE}\n\n{markdown_table(SUITE_HEADINGS, suites)}"
     )

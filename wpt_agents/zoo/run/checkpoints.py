@@ -15,7 +15,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -39,6 +39,20 @@ def resumes(agent: BaseAlgorithm) -> bool:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """What the processes of a run did before learning, which a resumed run does not do again.
+
+    :param commits: of the code, one for each process that had another one than those before
+    :param pretrained: the first digits of the SHA-256 of the pre-trained model, None without one
+    :param seconds: wall-clock seconds of each stage before learning
+    """
+
+    commits: Sequence[str] = ()
+    pretrained: str | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class State:
     """The content of `state.json`: all state besides the model file, the logs and the episodes.
 
@@ -48,6 +62,7 @@ class State:
     :param ep_info: SB3's information on the latest episodes
     :param files: the checksum of every file of the checkpoint
     :param cpu_seconds: processor seconds of learning so far; 0 in checkpoints of version 0.1
+    :param origin: empty in checkpoints of version 0.2
     """
 
     seconds: float
@@ -57,6 +72,12 @@ class State:
     ep_success: Sequence[bool]
     files: Mapping[str, str]
     cpu_seconds: float = 0.0
+    origin: Origin = Origin()
+
+    @classmethod
+    def of(cls, stored: dict[str, Any]) -> Self:
+        """Build a state from the content of its file."""
+        return cls(**stored | {"origin": Origin(**stored.get("origin", {}))})
 
 
 @dataclass(frozen=True)
@@ -69,7 +90,7 @@ class Checkpoint:
     @classmethod
     def read(cls, folder: Path) -> Self:
         """Read the state of a checkpoint."""
-        return cls(folder, State(**json.loads((folder / STATE).read_text(encoding="utf-8"))))
+        return cls(folder, State.of(json.loads((folder / STATE).read_text(encoding="utf-8"))))
 
     @property
     def model(self) -> Path:
@@ -113,12 +134,19 @@ class Checkpoint:
             agent.logger.record_mean(name, value)
 
 
-def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
+def write_checkpoint(
+    agent: Any,
+    run: Path,
+    seconds: float = 0.0,
+    cpu_seconds: float = 0.0,
+    origin: Origin = Origin(),
+) -> None:
     """Write a checkpoint into the run's folder; no episode may be in progress.
 
     :param agent: one that `resumes`
     :param seconds: wall-clock seconds of learning so far
     :param cpu_seconds: processor seconds of learning so far
+    :param origin: what was done before learning
     """
     _write_episodes(agent, run)
     folder = run / "checkpoints" / f"step-{agent.num_timesteps:09}"
@@ -138,6 +166,7 @@ def write_checkpoint(agent: Any, run: Path, seconds: float = 0.0, cpu_seconds: f
         ep_success=[bool(s) for s in agent.ep_success_buffer or []],
         files={path.name: _checksum(path) for path in sorted(aside.iterdir())},
         cpu_seconds=cpu_seconds,
+        origin=origin,
     )
     (aside / STATE).write_text(json.dumps(asdict(state)), encoding="utf-8")
     for path in aside.iterdir():
@@ -200,13 +229,20 @@ class Checkpoints(BaseCallback):
     :param every: steps between checkpoints; 0: only at the end, None: never
     :param seconds: wall-clock seconds of learning in earlier processes
     :param cpu_seconds: processor seconds of learning in earlier processes
+    :param origin: what was done before learning
     """
 
     def __init__(
-        self, run: Path, every: int | None, seconds: float = 0.0, cpu_seconds: float = 0.0
+        self,
+        run: Path,
+        every: int | None,
+        seconds: float = 0.0,
+        cpu_seconds: float = 0.0,
+        origin: Origin = Origin(),
     ) -> None:
         super().__init__()
         self.run = run
+        self.origin = origin
         self.every = every
         self.written = 0
         self.start = time.perf_counter() - seconds
@@ -229,8 +265,7 @@ class Checkpoints(BaseCallback):
         starts = self.model._last_episode_starts
         between = starts is not None and starts.all()  # but not within a long episode
         if self.every and between and self.model.num_timesteps - self.written >= self.every:
-            write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
-            self.written = self.model.num_timesteps
+            self._write()
 
     def _on_step(self) -> bool:
         return True
@@ -239,7 +274,11 @@ class Checkpoints(BaseCallback):
         interrupted = self.model._last_obs is None  # stopped by an error within an episode
         new = self.model.num_timesteps > self.written
         if self.every is not None and new and not interrupted:
-            write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds)
+            self._write()
+
+    def _write(self) -> None:
+        write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds, self.origin)
+        self.written = self.model.num_timesteps
 
 
 class HeadStart(BaseCallback):

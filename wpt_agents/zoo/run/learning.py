@@ -25,6 +25,7 @@ from wpt_agents.zoo.run.checkpoints import (
     Checkpoint,
     Checkpoints,
     HeadStart,
+    Origin,
     resumes,
 )
 from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
@@ -121,8 +122,11 @@ def build_index(run: Run, agent: BaseAlgorithm) -> None:
         retrieval.sheet_of_run(picture, agent, run.task, run.shared.env, run.seed)
 
 
-def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effort:
-    """Stage 4: fine-tuning, with evaluations if the preset requests them."""
+def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None, origin: Origin) -> Effort:
+    """Stage 4: fine-tuning, with evaluations if the preset requests them.
+
+    :param origin: what was done before, for the checkpoints
+    """
     repeat = run.preset.env.action_repeat
     steps = run.preset.steps
     done = agent.num_timesteps * repeat
@@ -138,7 +142,7 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None) -> Effo
         resume(run, agent, checkpoint)
     every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up: 0 means none
     checkpoints = Checkpoints(
-        run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds
+        run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds, origin
     )
     with closing(logger), evaluations(run) as evaluation:
         callbacks = [LearningBar(repeat), *evaluation, HeadStart(run.folder), checkpoints]

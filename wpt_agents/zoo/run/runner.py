@@ -8,7 +8,6 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from pathlib import Path
 
 import yaml
 from rich.markup import escape
@@ -20,7 +19,13 @@ from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import record_page, tables
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
-from wpt_agents.zoo.run.checkpoints import LOGS, Checkpoint, last_checkpoint, remove_checkpoints
+from wpt_agents.zoo.run.checkpoints import (
+    LOGS,
+    Checkpoint,
+    Origin,
+    last_checkpoint,
+    remove_checkpoints,
+)
 from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
 from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
@@ -102,7 +107,7 @@ def _begin(job: Run) -> Result:
 
 
 class Clock:
-    """The wall-clock seconds of each stage."""
+    """The wall-clock seconds of each stage, those of earlier processes included."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -112,7 +117,12 @@ class Clock:
         """Time a stage."""
         start = time.perf_counter()
         yield
-        self.seconds[stage] = round(time.perf_counter() - start, 1)
+        self.add({stage: time.perf_counter() - start})
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add seconds of stages."""
+        for stage, more in seconds.items():
+            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + more, 1)
 
 
 def do_stages(job: Run) -> Result:
@@ -128,20 +138,26 @@ def do_stages(job: Run) -> Result:
         with clock("pretrain"):
             start = pretrain(job.shared, dataset)
     checkpoint = last_checkpoint(job.folder)
+    before = checkpoint.state.origin if checkpoint is not None else Origin()
+    clock.add(before.seconds)
+    # The file may change while the run learns, or before it is resumed.
+    pretrained = before.pretrained or (file_hash(start) if start is not None else None)
     prepare_logs(job, checkpoint)
     with closing(make_training_env(job)) as venv:
         agent = make_agent(job, venv, dataset, start, checkpoint)
         if dataset is not None and checkpoint is None:  # a resumed run has already retrieved
             with clock("index"):
                 build_index(job, agent)
-        effort = learn(job, agent, checkpoint)
+        commits = tuple(dict.fromkeys((*before.commits, commit() or "unknown")))
+        origin = Origin(commits, pretrained, dict(clock.seconds))
+        effort = learn(job, agent, checkpoint, origin)
         clock.seconds["learn"] = round(effort.seconds, 1)
         agent.save(job.folder / "model.zip")
     with clock("evaluate"):
         scores = evaluate_policies(job, agent)
     with clock("pictures"):
         try_to_draw(job, agent, scores)
-    result = make_result(job, agent, scores, clock.seconds, effort, start)
+    result = make_result(job, agent, scores, clock.seconds, effort, origin)
     write_result(job.folder, result)
     remove_checkpoints(job.folder)
     return result
@@ -173,7 +189,7 @@ def make_result(
     scores: Mapping[str, Score],
     seconds: Mapping[str, float],
     effort: Effort,
-    start: Path | None,
+    origin: Origin,
 ) -> Result:
     """Assemble the result of a run."""
     return Result(
@@ -187,9 +203,9 @@ def make_result(
         metric=metric_of(job.task),
         scores=scores,
         seconds=seconds,
-        commit=commit(),
+        commit=None if origin.commits == ("unknown",) else ", ".join(origin.commits),
         updates=getattr(agent, "updates", getattr(agent, "_n_updates", None)),
         cpu_seconds=round(effort.cpu_seconds, 1),
         model=file_hash(final_model(job.folder)),
-        pretrained=file_hash(start) if start is not None else None,
+        pretrained=origin.pretrained,
     )

@@ -30,7 +30,7 @@ from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.result import Score
-from wpt_agents.zoo.run.checkpoints import Checkpoint, last_checkpoint
+from wpt_agents.zoo.run.checkpoints import Checkpoint, Origin, last_checkpoint
 from wpt_agents.zoo.run.folder import check_config, clear
 from wpt_agents.zoo.run.learning import (
     build_index,
@@ -161,7 +161,7 @@ def _learn_task(job: SequenceRun, number: int) -> Row:
         agent: Any = _begin(job, number, venv, dataset, start, checkpoint)
         if dataset is not None and checkpoint is None:
             build_index(run, agent)
-        effort = learn(run, agent, checkpoint)
+        effort = learn(run, agent, checkpoint, Origin())
         agent.save(run.folder / "model.zip")
     made = sum(row.updates for row in map(read_row, _folders(job, number)) if row is not None)
     scores = {

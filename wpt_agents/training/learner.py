@@ -193,45 +193,62 @@ class Learner(WorldModelLearner):
         :param imitation: added to the actor's loss, but not to the metric of it
         :param grounding: added to the critic's loss, but not to the metric of it
         """
-        policy = self.policy
-        settings = self.hyperparameters
-        through_dream = settings.actor_grad == "dynamics" and not head_start
+        through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):
             imagined = self.imagine(start, starts, generator)
-        dream, reward, value, returns, goes_on = imagined
-        spread, scale = self.return_scale(returns)
-        # In a new context: torch before 2.11 would use the weights again that it has cast above,
-        # without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
+        spread, scale = self.return_scale(imagined.returns)
+        metrics = self.update_actor(imagined, scale, imitation, head_start)
+        metrics |= self.update_critic(imagined, grounding)
+        self.policy.return_scale.copy_(spread)  # now that it is known to be finite
+        return metrics | {
+            "train/value": imagined.value.detach().mean(),
+            "train/imagined_reward": imagined.reward.detach().mean(),
+            "train/entropy": imagined.dream.entropy.detach().mean(),
+            "train/saturated_actions": imagined.dream.saturated,
+            "train/return_scale": scale,
+        }
+
+    def update_actor(
+        self, imagined: Imagined, scale: Tensor, imitation: Tensor | None, head_start: bool
+    ) -> Metrics:
+        """Take a step on Eq. (4) and the imitation, or in the head start on the imitation alone.
+
+        :param scale: what returns are divided by
+        :param imitation: added to the loss, but not to the metric of it
+        """
+        # In a new context: torch before 2.11 would use the weights again that it has cast in the
+        # dream, without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
         with self.autocast():
             loss = self.actor_loss(imagined, scale)
-        terms = [] if head_start else [loss]
-        terms += [] if imitation is None else [imitation]
-        actor_norm = torch.zeros_like(scale)
-        if terms:
-            actor_norm = self.descend(self.actor_optimizer, sum(terms[1:], terms[0]), "actor")
+        if head_start:
+            total = imitation
+        else:
+            total = loss if imitation is None else loss + imitation
+        norm = torch.zeros_like(scale)
+        if total is not None:
+            norm = self.descend(self.actor_optimizer, total, "actor")
+        return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
+
+    def update_critic(self, imagined: Imagined, grounding: Tensor | None) -> Metrics:
+        """Take a step on Eq. (3), and move the target critic.
+
+        :param grounding: added to the loss, but not to the metric of it
+        """
+        policy = self.policy
+        settings = self.hyperparameters
+        gamma = settings.gamma
+        goes_on = imagined.goes_on
+        bin_range = policy.bin_range
         with self.autocast():
-            logits = over_steps(policy.critic, dream.states.detach().but_last())
-            bins = policy.bin_range
-            value_loss = critic_loss(logits, returns, settings.gamma, goes_on, bins)
-            total = value_loss if grounding is None else value_loss + grounding
+            logits = over_steps(policy.critic, imagined.dream.states.detach().but_last())
+            loss = critic_loss(logits, imagined.returns, gamma, goes_on, bin_range)
+            total = loss if grounding is None else loss + grounding
             if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
-                slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on, bins)
+                slow = critic_loss(logits, imagined.value[:, :-1], gamma, goes_on, bin_range)
                 total = total + settings.slow_critic_scale * slow
-        critic_norm = self.descend(self.critic_optimizer, total, "critic")
-        policy.return_scale.copy_(spread)  # now that it is known to be finite
+        norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
-        metrics = {
-            "actor_loss": loss,
-            "critic_loss": value_loss,
-            "value": value.mean(),
-            "imagined_reward": reward.mean(),
-            "entropy": dream.entropy.mean(),
-            "saturated_actions": dream.saturated,
-            "return_scale": scale,
-            "actor_grad_norm": actor_norm,
-            "critic_grad_norm": critic_norm,
-        }
-        return {f"train/{name}": tensor.detach() for name, tensor in metrics.items()}
+        return {"train/critic_loss": loss.detach(), "train/critic_grad_norm": norm}
 
     def imagine(self, start: Latent, starts: Tensor, generator: Generator) -> Imagined:
         """Dream from some states and compute what the dreams are worth, Eq. (2)."""

@@ -141,14 +141,14 @@ class Plan2ExploreLearner(CuriousLearner):
         self.paid = replace(batch, reward=reward, reward_known=known)
         return post, metrics | {"explore/surprise": surprise[within].mean()}
 
-    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
         """Return the disagreement of the ensemble on imagined steps, (N, H)."""
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         feat = dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        arrival = self.paid.reward.flatten()[starts]
+        arrival = self.paid.reward.flatten()[index]
         assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
         return torch.cat([arrival[:, None], surprise], 1)
 

@@ -112,14 +112,14 @@ class Learner(WorldModelLearner):
             loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
-        starts = self.draw_starts(batch, generator)
-        start = post.flatten_time().pick(starts)
+        index = self.draw_starts(batch, generator)
+        start = post.flatten_time().pick(index)
         grounding = None
         if self.hyperparameters.repval_scale:
             loss = self.replay_value_loss(post, batch)
             metrics["train/replay_value_loss"] = loss.detach()
             grounding = self.hyperparameters.repval_scale * loss
-        metrics |= self.update_behavior(start, starts, generator, imitation, head_start, grounding)
+        metrics |= self.update_behavior(start, index, generator, imitation, head_start, grounding)
         return metrics
 
     @torch.no_grad()
@@ -169,7 +169,7 @@ class Learner(WorldModelLearner):
             return replay_value_loss(logits, returns, batch.reward_known, bin_range)
 
     def draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
-        """Return the numbers of the batch's states to imagine from, (N,)."""
+        """Return which of the flattened B x T states to imagine from, (N,)."""
         number = self.hyperparameters.value("imagine_starts")
         rows, length = batch.is_first.shape
         return draw_starts(rows, length, number, generator, self.policy.device)
@@ -177,7 +177,7 @@ class Learner(WorldModelLearner):
     def update_behavior(
         self,
         start: Latent,
-        starts: Tensor,
+        index: Tensor,
         generator: Generator,
         imitation: Tensor | None = None,
         head_start: bool = False,
@@ -189,13 +189,13 @@ class Learner(WorldModelLearner):
         prior actor it is not updated: reward head and critic learn first.
 
         :param start: (N, ...), the states to start from
-        :param starts: (N,), their numbers in the batch
+        :param index: (N,), where they are in the flattened batch
         :param imitation: added to the actor's loss, but not to the metric of it
         :param grounding: added to the critic's loss, but not to the metric of it
         """
         through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):
-            imagined = self.imagine(start, starts, generator)
+            imagined = self.imagine(start, index, generator)
         spread, scale = self.return_scale(imagined.returns)
         metrics = self.update_actor(imagined, scale, imitation, head_start)
         metrics |= self.update_critic(imagined, grounding)
@@ -250,11 +250,11 @@ class Learner(WorldModelLearner):
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
         return {"train/critic_loss": loss.detach(), "train/critic_grad_norm": norm}
 
-    def imagine(self, start: Latent, starts: Tensor, generator: Generator) -> Imagined:
+    def imagine(self, start: Latent, index: Tensor, generator: Generator) -> Imagined:
         """Dream from some states and compute what the dreams are worth, Eq. (2)."""
         settings = self.hyperparameters
         dream = self.policy.dream(start, settings.imagine_horizon, generator)
-        reward = self.imagined_reward(dream, starts)
+        reward = self.imagined_reward(dream, index)
         value = over_steps(self.policy.target_critic.value, dream.states)
         goes_on = self.imagined_continue(dream)
         returns = lambda_return(reward, value, settings.gamma, settings.lam, goes_on)
@@ -285,10 +285,11 @@ class Learner(WorldModelLearner):
             scale,
         )
 
-    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
         """Return the rewards of arriving in the imagined states 0 .. H-1, (N, H).
 
-        :param starts: (N,), the numbers of the starting states in the batch
+        :param index: (N,), where the dreams start in the flattened batch; rewards by the heads do
+            not depend on it, those of a subclass may
         """
         model = self.policy.world_model
         states = dream.states.but_last()

@@ -97,30 +97,31 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        imitator = self.policy.imitator if self.hyperparameters.residual else None
+        settings = self.hyperparameters
+        imitator = self.policy.imitator if settings.residual else None
         advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
-        if advice is not None and imitation_weight and self.hyperparameters.imitation_grad:
+        if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
         post, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
-        imitation = None
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
             loss = self.imitation_loss(imitator, post, advice)
             self.descend(self.imitator_optimizer, loss, "imitator")
+        imitation = None
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
-        index = self.draw_starts(batch, generator)
-        start = post.flatten_time().pick(index)
-        grounding = None
-        if self.hyperparameters.repval_scale:
+        replay_loss = None
+        if settings.repval_scale:
             loss = self.replay_value_loss(post, batch)
             metrics["train/replay_value_loss"] = loss.detach()
-            grounding = self.hyperparameters.repval_scale * loss
-        metrics |= self.update_behavior(start, index, generator, imitation, head_start, grounding)
-        return metrics
+            replay_loss = settings.repval_scale * loss
+        index = self.draw_starts(batch, generator)
+        start = post.flatten_time().pick(index)
+        behavior = self.update_behavior(start, index, generator, imitation, head_start, replay_loss)
+        return metrics | behavior
 
     @torch.no_grad()
     def advice(self, batch: Batch) -> Tensor:
@@ -181,7 +182,7 @@ class Learner(WorldModelLearner):
         generator: Generator,
         imitation: Tensor | None = None,
         head_start: bool = False,
-        grounding: Tensor | None = None,
+        replay_loss: Tensor | None = None,
     ) -> Metrics:
         """Train actor and critic on imagined trajectories, Eq. (2) to (4).
 
@@ -191,14 +192,14 @@ class Learner(WorldModelLearner):
         :param start: (N, ...), the states to start from
         :param index: (N,), where they are in the flattened batch
         :param imitation: added to the actor's loss, but not to the metric of it
-        :param grounding: added to the critic's loss, but not to the metric of it
+        :param replay_loss: added to the critic's loss, but not to the metric of it
         """
         through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):
             imagined = self.imagine(start, index, generator)
         spread, scale = self.return_scale(imagined.returns)
         metrics = self.update_actor(imagined, scale, imitation, head_start)
-        metrics |= self.update_critic(imagined, grounding)
+        metrics |= self.update_critic(imagined, replay_loss)
         self.policy.return_scale.copy_(spread)  # now that it is known to be finite
         return metrics | {
             "train/value": imagined.value.detach().mean(),
@@ -229,10 +230,10 @@ class Learner(WorldModelLearner):
             norm = self.descend(self.actor_optimizer, total, "actor")
         return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
 
-    def update_critic(self, imagined: Imagined, grounding: Tensor | None) -> Metrics:
+    def update_critic(self, imagined: Imagined, replay_loss: Tensor | None) -> Metrics:
         """Take a step on Eq. (3), and move the target critic.
 
-        :param grounding: added to the loss, but not to the metric of it
+        :param replay_loss: added to the loss, but not to the metric of it
         """
         policy = self.policy
         settings = self.hyperparameters
@@ -242,7 +243,7 @@ class Learner(WorldModelLearner):
         with self.autocast():
             logits = over_steps(policy.critic, imagined.dream.states.detach().but_last())
             loss = critic_loss(logits, imagined.returns, gamma, goes_on, bin_range)
-            total = loss if grounding is None else loss + grounding
+            total = loss if replay_loss is None else loss + replay_loss
             if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
                 slow = critic_loss(logits, imagined.value[:, :-1], gamma, goes_on, bin_range)
                 total = total + settings.slow_critic_scale * slow

@@ -61,14 +61,13 @@ class CuriousLearner(Learner):
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
         assert isinstance(policy.curiosity, nn.Module)
-        rate = self.hyperparameters.value("learning_rate")
-        self.curiosity_optimizer = self.adam([list(policy.curiosity.parameters())], float(rate))
+        parts = [list(policy.curiosity.parameters())]
+        self.curiosity_optimizer = self.adam(parts, self.model_rate)
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
         super().configure(hyperparameters)
-        rate = self.hyperparameters.value("learning_rate")
-        self.set_rate(self.curiosity_optimizer, float(rate))
+        self.set_rate(self.curiosity_optimizer, self.model_rate)
 
     def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
         """DreamerV3's replay value loss, on returns of curiosity: the critic's value is theirs."""

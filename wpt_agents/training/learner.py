@@ -59,11 +59,16 @@ class Learner(WorldModelLearner):
 
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
-        rate = self.hyperparameters.value("actor_critic_learning_rate")
+        rate = self.actor_critic_rate
         self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
         self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
         self.add_imitator()
         self.step = 0  # collected steps, by which schedules go
+
+    @property
+    def actor_critic_rate(self) -> float:
+        """The learning rate of actor, critic and imitator."""
+        return float(self.hyperparameters.value("actor_critic_learning_rate"))
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
@@ -72,7 +77,7 @@ class Learner(WorldModelLearner):
 
     def set_actor_critic_rate(self, share: float) -> None:
         """Set the learning rates of actor and critic to a share of their keyword."""
-        rate = share * self.hyperparameters.value("actor_critic_learning_rate")
+        rate = share * self.actor_critic_rate
         self.set_rate(self.actor_optimizer, rate)
         self.set_rate(self.critic_optimizer, rate)
         if self.imitator_optimizer is not None:
@@ -82,8 +87,8 @@ class Learner(WorldModelLearner):
         """Make an optimiser of the policy's imitator, if it has one."""
         self.imitator_optimizer: Optimizer | None = None
         if imitator := self.policy.imitator:
-            rate = self.hyperparameters.value("actor_critic_learning_rate")
-            self.imitator_optimizer = self.adam([list(imitator.parameters())], rate)
+            parts = [list(imitator.parameters())]
+            self.imitator_optimizer = self.adam(parts, self.actor_critic_rate)
 
     def update(
         self,

@@ -173,13 +173,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
         settings = self.hyperparameters
         progress = self.progress
-        used = settings.needs_clone or settings.offline_ratio
-        if self.dataset is None and progress.retrieved_ids and settings.offline_ratio:
-            what = "Without its dataset the model rehearses nothing: load it with dataset="
-            warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=3)
-        elif self.dataset is None and used and not progress.retrieved_ids:
-            warnings.warn(NO_DATASET, stacklevel=3)
-        if self.dataset is None or self.retrieved is not None or not used:
+        if not (settings.needs_clone or settings.offline_ratio):
+            return
+        if self.dataset is None:
+            self._warn_without_dataset()
+            return
+        if self.retrieved is not None:
             return
         kept = self.kept.trajectories if self.kept is not None else []
         if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
@@ -193,11 +192,19 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             )
             progress.retrieved_of = self.dataset.fingerprint
         retrieved = ReplayBuffer()
-        numbers = progress.retrieved_ids
-        read = read_retrieved(self.dataset, kept, numbers, self.action_space)
-        for trajectory in shown(read, len(numbers), "retrieve", progress_bar):
+        ids = progress.retrieved_ids
+        trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
+        for trajectory in shown(trajectories, len(ids), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
-        self.retrieved = retrieved
+        self.retrieved = retrieved  # only now, so that an interruption leaves no part of it
+
+    def _warn_without_dataset(self) -> None:
+        """Warn of what the missing dataset prevents, if anything."""
+        if not self.progress.retrieved_ids:
+            warnings.warn(NO_DATASET, stacklevel=4)
+        elif self.hyperparameters.offline_ratio:
+            what = "Without its dataset the model rehearses nothing: load it with dataset="
+            warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=4)
 
     def clone(self, progress_bar: bool = False) -> None:
         """Train the prior actor on the retrieved trajectories, once for a task."""

@@ -180,7 +180,7 @@ def test_one_process_goes_on_from_what_a_pair_left_of_which_one_was_killed(pair,
     left = {path.name.partition(".")[0] for path in (pair / "killed").iterdir()}
     assert left == {"model", "progress", "events"}
     header, _ = read_model(pair / "killed" / "model.zip")
-    assert header["counters"]["pretrain_steps"] == 4  # of the five made, EVERY being 2
+    assert header["counters"]["pretrain_steps"] == 4  # of the five made, SAVE_EVERY being 2
     model, seen = train(pair / "data", run_dir=pair / "killed", **jobs["mean"])
     assert list(seen) == [5, 6]
     assert_equal(seen, weights(model), *alone["mean"])

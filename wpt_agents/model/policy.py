@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.choosing import actor_or_clone, corrected
+from wpt_agents.model.choosing import actor_or_prior, corrected
 from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
@@ -96,7 +96,7 @@ class WPTPolicy(PixelPolicy):
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
-        """Draw new weights for all that belongs to a task: reward head, actor, critic, clone."""
+        """Draw new weights for all that belongs to a task: reward head, actors, critics."""
         size = self.size
         device = self.device
         self.world_model.reset_reward_head()
@@ -199,7 +199,7 @@ class WPTPolicy(PixelPolicy):
             dist = corrected(self, dist, post, self._tensor(seen[0]))
         action = dist.mode if deterministic else dist.rsample(generator)
         if self.ibrl:
-            action = actor_or_clone(self, post, action, self._tensor(seen[0]))
+            action = actor_or_prior(self, post, action, self._tensor(seen[0]))
         latent = [x.cpu().numpy() for x in post]
         state = (*latent, *seen, action.cpu().numpy())
         if not np.isfinite(state[-1]).all():

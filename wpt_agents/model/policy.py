@@ -229,6 +229,7 @@ class WPTPolicy(PixelPolicy):
         """Imagine with the actor in the frozen world model; gradients run through the dynamics.
 
         :param start: (N, ...), the states to start from
+        :param horizon: H
         """
         with frozen(self.world_model):
             return imagine(self, start.detach(), horizon, generator)
@@ -311,7 +312,7 @@ def acting_step(
 
 @op
 def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None) -> Dream:
-    """Imagine with the actor from N states."""
+    """Imagine `horizon` steps with the actor, from N states (N, ...)."""
     entropies: list[Tensor] = []
     saturated: list[Tensor] = []
 

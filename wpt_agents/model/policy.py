@@ -192,19 +192,19 @@ class WPTPolicy(PixelPolicy):
         # The authors draw the latent even if the action is deterministic.
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.acting_actor.truncated(outputs, self.action_mask)
-        seen: list[np.ndarray] = []
+        frames: list[np.ndarray] = []  # of the prior actor, if it takes part
         if self.sees_frames:
-            seen = [stack_frames(image, state[2] if state else None, first)]
+            frames = [stack_frames(image, state[2] if state else None, first)]
         if self.residual:
-            dist = corrected(self, dist, post, self._tensor(seen[0]))
-        action = dist.mode if deterministic else dist.rsample(generator)
+            dist = corrected(self, dist, post, self._tensor(frames[0]))
+        decision = dist.mode if deterministic else dist.rsample(generator)
         if self.ibrl:
-            action = actor_or_prior(self, post, action, self._tensor(seen[0]))
-        latent = [x.cpu().numpy() for x in post]
-        state = (*latent, *seen, action.cpu().numpy())
-        if not np.isfinite(state[-1]).all():
+            decision = actor_or_prior(self, post, decision, self._tensor(frames[0]))
+        action = decision.cpu().numpy()
+        if not np.isfinite(action).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
-        return state[-1], state
+        latent = [x.cpu().numpy() for x in post]
+        return action, (*latent, *frames, action)
 
     def _with_frames(self, state: State, image: np.ndarray) -> State:
         """Add or remove the images of a state, so that keywords can change within an episode."""

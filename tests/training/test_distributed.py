@@ -18,7 +18,8 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.distributions import Share, exponential, kl_one_hot
 from wpt_agents.model.world_model import world_model_loss
-from wpt_agents.training.distributed import World, part_free_nats
+from wpt_agents.training.distributed import World
+from wpt_agents.training.divided import part_free_nats
 from wpt_agents.zoo.commands import app as command_line
 
 JOBS = {

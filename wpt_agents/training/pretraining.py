@@ -11,7 +11,8 @@ import numpy as np
 from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
-from wpt_agents.training.distributed import Divided, World
+from wpt_agents.training.distributed import World
+from wpt_agents.training.divided import Divided
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.logs import PretrainingLog
 from wpt_agents.training.progress import WorldModelProgress

@@ -87,12 +87,13 @@ class WPTPolicy(PixelPolicy):
         self.actor_outscale = actor_outscale
         self.bin_range = bin_range
         self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads, bin_range)
-        self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
+        mask = torch.zeros(max_action_dim, dtype=torch.bool)
+        self.register_buffer("action_mask", mask, persistent=False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
         self.world_model.make_reward_members(range(reward_ensemble - 1))
         if continue_head:
-            self.world_model.make_continue_head(0.0, 0)
+            self.world_model.make_continue_head(log_odds=0.0, seed=0)
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
@@ -103,8 +104,8 @@ class WPTPolicy(PixelPolicy):
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
         self.critic = Critic(size, self.zero_init_heads, self.bin_range).to(device)
-        self.target_critic = Critic(size, False, self.bin_range).to(device).requires_grad_(False)
-        self.target_critic.load_state_dict(self.critic.state_dict())
+        self.target_critic = Critic(size, bin_range=self.bin_range).to(device)
+        self.target_critic.requires_grad_(False).load_state_dict(self.critic.state_dict())
         self.average_actor = None
         self.imitator = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)

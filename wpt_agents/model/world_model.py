@@ -190,7 +190,7 @@ class WorldModel(nn.Module):
         :param log_odds: of going on, before anything is learned
         :param seed: of its random numbers
         """
-        self.continue_head = self._seeded_head(1, True, seed)
+        self.continue_head = self._seeded_head(1, zero_init=True, seed=seed)
         nn.init.constant_(self.continue_head.layers[-1].get_parameter("bias"), log_odds)
 
     def _seeded_head(self, outputs: int, zero_init: bool, seed: int) -> Head:

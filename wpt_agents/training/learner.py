@@ -108,7 +108,9 @@ class Learner(WorldModelLearner):
         states_loss = None
         if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
-        post, metrics = self.update_world_model(batch, generator, True, states_loss)
+        post, metrics = self.update_world_model(
+            batch, generator, learn_reward=True, states_loss=states_loss
+        )
         metrics |= self.update_continue_head(post, batch)
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
             loss = self.imitation_loss(imitator, post, advice)

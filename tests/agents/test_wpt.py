@@ -172,7 +172,7 @@ def test_pretraining_in_two_parts_equals_one_to_the_last_bit(store, tmp_path):
 
 
 def test_killed_pretraining_goes_on_from_its_last_checkpoint(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(pretraining, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "SAVE_EVERY", 2)
 
     def die(step, _):
         if step == 3:

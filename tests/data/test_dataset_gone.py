@@ -38,7 +38,7 @@ def mount(store):
 def test_pretraining_stops_by_name_and_goes_on_exactly_when_the_dataset_is_back(
     store, paused, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(pretraining, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "SAVE_EVERY", 2)
     whole = pretrained(store, steps=8)
 
     def disappear(step, _):

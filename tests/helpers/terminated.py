@@ -30,7 +30,7 @@ def terminate_at_the_fifth_update():
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    pretraining.EVERY = 2
+    pretraining.SAVE_EVERY = 2
     attempt = int(os.environ["TORCHELASTIC_RESTART_COUNT"])
     if attempt == 0 and os.environ["RANK"] == "1":
         terminate_at_the_fifth_update()

@@ -26,7 +26,7 @@ def train(dataset, **changes):
 def together(rank, folder, jobs):
     """Does the jobs, keywords of `train` by name; then rank 1 dies in the middle of the first."""
     torch.set_num_threads(1)
-    pretraining.EVERY = 2
+    pretraining.SAVE_EVERY = 2
     meeting = f"file://{folder}/meeting"
     dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=2)
     for name, changes in jobs.items():

@@ -18,7 +18,8 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.distributions import Share, exponential, kl_one_hot
 from wpt_agents.model.world_model import world_model_loss
-from wpt_agents.training.distributed import World, part_free_nats
+from wpt_agents.training.distributed import World
+from wpt_agents.training.divided import part_free_nats
 from wpt_agents.zoo.commands import app as command_line
 
 JOBS = {
@@ -180,7 +181,7 @@ def test_one_process_goes_on_from_what_a_pair_left_of_which_one_was_killed(pair,
     left = {path.name.partition(".")[0] for path in (pair / "killed").iterdir()}
     assert left == {"model", "progress", "events"}
     header, _ = read_model(pair / "killed" / "model.zip")
-    assert header["counters"]["pretrain_steps"] == 4  # of the five made, EVERY being 2
+    assert header["counters"]["pretrain_steps"] == 4  # of the five made, SAVE_EVERY being 2
     model, seen = train(pair / "data", run_dir=pair / "killed", **jobs["mean"])
     assert list(seen) == [5, 6]
     assert_equal(seen, weights(model), *alone["mean"])

@@ -276,7 +276,7 @@ def test_a_clone_whose_loss_is_nan_stops_with_finite_weights(monkeypatch):
 
 
 def test_pretraining_that_diverges_keeps_its_last_checkpoint(monkeypatch, tmp_path):
-    monkeypatch.setattr(pretraining, "EVERY", 2)
+    monkeypatch.setattr(pretraining, "SAVE_EVERY", 2)
 
     def damage(step, _):
         if step == 3:

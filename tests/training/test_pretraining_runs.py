@@ -38,7 +38,7 @@ class Terminated(Exception):
 def often(monkeypatch):
     """Write a row of every two updates, and a model of every four."""
     monkeypatch.setattr(logs, "LOG_EVERY", 2)
-    monkeypatch.setattr(pretraining, "EVERY", 4)
+    monkeypatch.setattr(pretraining, "SAVE_EVERY", 4)
 
 
 @pytest.fixture(autouse=True)

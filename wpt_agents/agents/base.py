@@ -154,7 +154,7 @@ class PixelAgent(SavedAgent):
         self._reset_seen = last_reset(self.env)
         if self.verbose:
             print(self)
-        made = self.updates
+        updates_before = self.updates
         # What earlier steps paid for is kept, so that short calls in a row learn, too.
         begun = self.num_timesteps >= self.learning_starts and len(self.replay_buffer) > 0
         continued = begun and not reset_num_timesteps
@@ -169,7 +169,7 @@ class PixelAgent(SavedAgent):
         finally:
             callback.on_training_end()
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
-        outlook.warn(over=True, learns=continued or self.updates > made)
+        outlook.warn(over=True, learns=continued or self.updates > updates_before)
 
     @property
     def unfinished(self) -> bool:

@@ -60,14 +60,13 @@ class CuriousLearner(Learner):
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
         assert isinstance(policy.curiosity, nn.Module)
-        rate = self.hyperparameters.value("learning_rate")
-        self.curiosity_optimizer = self.adam([list(policy.curiosity.parameters())], float(rate))
+        parts = [list(policy.curiosity.parameters())]
+        self.curiosity_optimizer = self.adam(parts, self.model_rate)
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
         super().configure(hyperparameters)
-        rate = self.hyperparameters.value("learning_rate")
-        self.set_rate(self.curiosity_optimizer, float(rate))
+        self.set_rate(self.curiosity_optimizer, self.model_rate)
 
     def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
         """DreamerV3's replay value loss, on returns of curiosity: the critic's value is theirs."""
@@ -140,14 +139,14 @@ class Plan2ExploreLearner(CuriousLearner):
         self.paid = replace(batch, reward=reward, reward_known=known)
         return post, metrics | {"explore/surprise": surprise[within].mean()}
 
-    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
         """Return the disagreement of the ensemble on imagined steps, (N, H)."""
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         feat = dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        arrival = self.paid.reward.flatten()[starts]
+        arrival = self.paid.reward.flatten()[index]
         assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
         return torch.cat([arrival[:, None], surprise], 1)
 

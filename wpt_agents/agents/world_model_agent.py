@@ -119,7 +119,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         model = self.policy.world_model
         model.continue_head = None
         if any(name.startswith("world_model.continue_head.") for name in weights):
-            model.make_continue_head(0.0, 0)
+            model.make_continue_head(log_odds=0.0, seed=0)
         self.learner.add_continue_head()
         start = "world_model.reward_members."
         members = {name.split(".")[2] for name in weights if name.startswith(start)}

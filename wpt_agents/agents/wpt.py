@@ -24,6 +24,7 @@ from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
 from wpt_agents.data.replay import ReplayBuffer, mix
+from wpt_agents.data.trajectory import Batch
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
@@ -173,13 +174,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
         settings = self.hyperparameters
         progress = self.progress
-        used = settings.needs_clone or settings.offline_ratio
-        if self.dataset is None and progress.retrieved_ids and settings.offline_ratio:
-            what = "Without its dataset the model rehearses nothing: load it with dataset="
-            warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=3)
-        elif self.dataset is None and used and not progress.retrieved_ids:
-            warnings.warn(NO_DATASET, stacklevel=3)
-        if self.dataset is None or self.retrieved is not None or not used:
+        if not (settings.needs_clone or settings.offline_ratio):
+            return
+        if self.dataset is None:
+            self._warn_without_dataset()
+            return
+        if self.retrieved is not None:
             return
         kept = self.kept.trajectories if self.kept is not None else []
         if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
@@ -193,11 +193,19 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             )
             progress.retrieved_of = self.dataset.fingerprint
         retrieved = ReplayBuffer()
-        numbers = progress.retrieved_ids
-        read = read_retrieved(self.dataset, kept, numbers, self.action_space)
-        for trajectory in shown(read, len(numbers), "retrieve", progress_bar):
+        ids = progress.retrieved_ids
+        trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
+        for trajectory in shown(trajectories, len(ids), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
-        self.retrieved = retrieved
+        self.retrieved = retrieved  # only now, so that an interruption leaves no part of it
+
+    def _warn_without_dataset(self) -> None:
+        """Warn of what the missing dataset prevents, if anything."""
+        if not self.progress.retrieved_ids:
+            warnings.warn(NO_DATASET, stacklevel=4)
+        elif self.hyperparameters.offline_ratio:
+            what = "Without its dataset the model rehearses nothing: load it with dataset="
+            warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=4)
 
     def clone(self, progress_bar: bool = False) -> None:
         """Train the prior actor on the retrieved trajectories, once for a task."""
@@ -222,7 +230,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.progress.cloned = True
         self.choose_who_acts()
 
-    # // Collect Data: see `PixelAgent.collect`, which asks these
+    # // Collect Data: the loop is `PixelAgent.collect`, which calls these
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
         """Return the steps of a new episode at which the prior actor acts."""
@@ -241,15 +249,18 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     # // Update Models
 
+    @property
+    def head_start(self) -> int:
+        """How many updates of the head start (`actor_delay`) are left to make."""
+        return max(self.hyperparameters.actor_delay - self.progress.task_updates, 0)
+
     def steps_per_update(self) -> float:
         """Return how many collected steps the first update needs; a head start needs none."""
-        pending = self.hyperparameters.actor_delay > self.progress.task_updates
-        return 0.0 if pending else super().steps_per_update()
+        return 0.0 if self.head_start else super().steps_per_update()
 
     def updates_due(self) -> int:
         """Return how many updates to make now: those for the collected steps, or the head start."""
-        head_start = self.hyperparameters.actor_delay - self.progress.task_updates
-        return max(super().updates_due(), head_start)
+        return max(super().updates_due(), self.head_start)
 
     def update(self, metrics: Metrics) -> None:
         """Make one update of every network on a mixed batch; append to `metrics`."""
@@ -258,35 +269,45 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.adapt_to_data(self.replay_buffer)
         self.learn_ends()
         self.fit_reward_ensemble()
-        batch = mix(
+        head_start = self.head_start > 0
+        if settings.residual and progress.cloned and not head_start:
+            self.begin_residual()
+        if settings.actor_critic_decay:
+            left = 1 - progress.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
+        self.learner.step = progress.num_timesteps
+        batch = self.mixed_batch()
+        generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
+        with self.operations():
+            update = self.learner.update(batch, generator, self.imitation_weight(), head_start)
+        for name, value in update.items():
+            metrics[name].append(value)
+        self.policy.average(self.averaging())
+        progress.updates += 1
+        progress.task_updates += 1
+
+    def mixed_batch(self) -> Batch:
+        """Draw the batch of the next update: collected sequences, then retrieved ones."""
+        settings = self.hyperparameters
+        return mix(
             self.replay_buffer,
             self.retrieved,
             settings.offline_ratio,
             settings.batch_size,
             settings.batch_length,
             settings.max_action_dim,
-            self.streams.numpy(Purpose.UPDATE, progress.updates),
+            self.streams.numpy(Purpose.UPDATE, self.progress.updates),
             settings.recent_share,
             settings.marks,
         ).to(self.device)
-        head_start = progress.task_updates < settings.actor_delay
-        imitation = settings.kickstart_at(progress.num_timesteps) if progress.cloned else 0.0
-        if head_start and progress.cloned:
-            imitation = max(imitation, 1.0)  # the only term of the loss, so any weight will do
-        if settings.residual and progress.cloned and not head_start:
-            self.begin_residual()
-        if settings.actor_critic_decay:
-            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
-        self.learner.step = progress.num_timesteps
-        generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
-        with self.operations():
-            update = self.learner.update(batch, generator, imitation, head_start)
-        for name, value in update.items():
-            metrics[name].append(value)
-        self.policy.average(self.averaging())
-        progress.updates += 1
-        progress.task_updates += 1
+
+    def imitation_weight(self) -> float:
+        """Return the weight of the loss by which the actor imitates the prior actor."""
+        if not self.progress.cloned:
+            return 0.0
+        weight = self.hyperparameters.kickstart_at(self.num_timesteps)
+        # In the head start it is the only term of the loss, so any weight will do.
+        return max(weight, 1.0) if self.head_start else weight
 
     def begin_residual(self) -> None:
         """Copy the actor: its difference to this imitator is added to the prior actor's action."""

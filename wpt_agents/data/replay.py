@@ -78,9 +78,8 @@ class ReplayBuffer:
     def draw_recent(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
         """Draw pieces as `draw` does, from the five newest episodes alone."""
         lengths = np.array([len(t) for t in self.trajectories[-NEWEST:]])
-        before = len(self.trajectories) - len(lengths)
         rows = Windows(lengths).draw(batch_size, length, rng)
-        return [[(before + i, start, stop) for i, start, stop in row] for row in rows]
+        return _renumbered(rows, len(self.trajectories) - len(lengths))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one file (arrays and JSON, no pickle) atomically.
@@ -141,22 +140,29 @@ def mix(
     """
     if not 0 <= ratio <= 1:
         raise ValueError(f"The share of retrieved data must be in [0, 1], got {ratio}")
-    others = round(batch_size * ratio) if retrieved else 0
-    trajectories, rows = online.trajectories, []
-    recent = round((batch_size - others) * recent_share)
-    if others < batch_size:
-        rows = online.draw(batch_size - others - recent, length, rng) if recent_share < 1 else []
-        rows += online.draw_recent(recent, length, rng) if recent else []
-    if retrieved and others:
-        behind = len(trajectories)
+    n_retrieved = round(batch_size * ratio) if retrieved else 0
+    n_online = batch_size - n_retrieved
+    n_recent = round(n_online * recent_share)
+    trajectories = online.trajectories
+    rows: list[Row] = []
+    if n_online > n_recent:
+        rows += online.draw(n_online - n_recent, length, rng)
+    if n_recent:
+        rows += online.draw_recent(n_recent, length, rng)
+    if retrieved and n_retrieved:
+        drawn = retrieved.draw(n_retrieved, length, rng)
+        rows += _renumbered(drawn, len(trajectories))
         trajectories = trajectories + retrieved.trajectories
-        drawn = retrieved.draw(others, length, rng)
-        rows += [[(behind + i, start, stop) for i, start, stop in row] for row in drawn]
     batch = _batch_of(trajectories, rows, action_width, mark)
     # The retrieved rows are last, as in the authors' batches of 12 + 4.
-    batch.reward[batch_size - others :] = 0
-    batch.reward_known[batch_size - others :] = False
+    batch.reward[n_online:] = 0
+    batch.reward_known[n_online:] = False
     return batch
+
+
+def _renumbered(rows: list[Row], offset: int) -> list[Row]:
+    """Return the rows for a list of trajectories with `offset` others in front."""
+    return [[(offset + i, start, stop) for i, start, stop in row] for row in rows]
 
 
 def _batch_of(

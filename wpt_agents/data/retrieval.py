@@ -46,7 +46,8 @@ class Retriever:
         self.features = np.ascontiguousarray(features, np.float32)
         self.action_dims = np.asarray(action_dims)
         self.embodiments = list(embodiments)
-        self.encoder_id, self.dataset_id = encoder_id, dataset_id
+        self.encoder_id = encoder_id
+        self.dataset_id = dataset_id
 
     @classmethod
     def build(
@@ -63,7 +64,8 @@ class Retriever:
         :param encoder_id: which encoder `embed` is, such as a hash of its weights
         :param progress_bar: show a progress bar
         """
-        features, at = np.zeros((len(dataset), 0), np.float32), 0
+        features = np.zeros((len(dataset), 0), np.float32)
+        at = 0
         with StageBar(len(dataset), "index", progress_bar) as bar:
             for image in dataset.first_observations():
                 feature = np.asarray(embed(image), np.float32)
@@ -125,7 +127,7 @@ class Retriever:
         embodiment: str | None = None,
         action_dim: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Eq. (5): D = ||e(o_on) - e(o_off)||_2, the `k` nearest, each trajectory once.
+        """Return the `k` trajectories that are nearest by Eq. (5), each once.
 
         :param embed: (E,), the features of the task's first observation, or (Q, E), those of the
             first observations of Q episodes, which take their nearest trajectories in turns
@@ -145,19 +147,7 @@ class Retriever:
         candidates = self._candidates(embodiment, action_dim)
         if len(candidates) == 0 or k < 1:
             return np.zeros(0, np.int64), np.zeros(0, np.float32)
-        import faiss
-
-        nearest = []
-        for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
-            chunk = candidates[at : at + CHUNK]
-            # exact search, as the authors' IndexFlatL2
-            squared, near = faiss.knn(queries, self.features[chunk], min(k, len(chunk)))
-            nearest.append((chunk[near], squared))
-        indices, squared = (np.concatenate(parts, 1) for parts in zip(*nearest, strict=True))
-        order = np.lexsort((indices, squared))[:, :k]  # equally near: in the dataset's order
-        indices = np.take_along_axis(indices, order, 1)
-        squared = np.take_along_axis(squared, order, 1)
-        indices, squared = in_turns(indices, squared, k)
+        indices, squared = in_turns(*nearest(queries, self.features, candidates, k), k)
         return indices, np.sqrt(squared)
 
     def draw(
@@ -234,6 +224,29 @@ class Retriever:
             )
         labels = arrays["action_dims"], head["embodiments"]
         return cls(arrays["features"], *labels, encoder_id, head.get("dataset_id", ""))
+
+
+def nearest(
+    queries: np.ndarray, features: np.ndarray, candidates: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eq. (5): the candidates with the smallest D = ||e(o_on) - e(o_off)||_2 to each query.
+
+    :param queries: (Q, E) float32, e(o_on)
+    :param features: (N, E) float32, e(o_off)
+    :param candidates: (M,), which rows of `features` to compare; at least one
+    :return: the rows (Q, k') and their D^2 (Q, k'), nearest first; k' < k if there are no more
+    """
+    import faiss
+
+    parts = []
+    for at in range(0, len(candidates), CHUNK):  # never a second copy of all features
+        chunk = candidates[at : at + CHUNK]
+        # exact search, as the authors' IndexFlatL2
+        squared, near = faiss.knn(queries, features[chunk], min(k, len(chunk)))
+        parts.append((chunk[near], squared))
+    indices, squared = (np.concatenate(part, 1) for part in zip(*parts, strict=True))
+    order = np.lexsort((indices, squared))[:, :k]  # equally near: in the dataset's order
+    return np.take_along_axis(indices, order, 1), np.take_along_axis(squared, order, 1)
 
 
 def in_turns(indices: np.ndarray, squared: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:

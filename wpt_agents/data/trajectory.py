@@ -175,7 +175,7 @@ class Batch:
         assert len(set(shapes.values())) == 1, shapes
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch on `device`; a copy from pinned memory runs beside the computation."""
+        """Return the batch on `device`; a copy from pinned memory runs beside the computation."""
         pinned = self.image.is_pinned()
         return replace(
             self,
@@ -183,7 +183,7 @@ class Batch:
         )
 
     def split(self, parts: int) -> list["Batch"]:
-        """Its rows in order, in `parts` batches of as many rows each."""
+        """Split the rows, in their order, into `parts` batches of equally many rows."""
         rows, left = divmod(len(self.image), parts)
         assert left == 0, (len(self.image), parts)
         streams = {f.name: getattr(self, f.name).split(rows) for f in fields(self)}
@@ -191,7 +191,7 @@ class Batch:
         return [replace(self, **row) for row in rows_of]
 
     def pin(self) -> "Batch":
-        """The same batch in pinned memory."""
+        """Return the batch in pinned memory."""
         return replace(self, **{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
 
@@ -219,7 +219,7 @@ def moving_pixels(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 
 def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[str, np.ndarray]:
-    """Images start .. stop - 1 of a trajectory, each with the action and reward that led to it.
+    """Return images start .. stop - 1, each with the action and reward that led to it.
 
     This is the only place where actions and rewards are shifted against images.
 
@@ -227,11 +227,13 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
         `action_dim` are zero, whatever the trajectory holds there
     :return: the streams of a Batch for one sequence: (stop - start, ...) arrays
     """
-    length, used = len(trajectory), trajectory.action_dim
+    length = len(trajectory)
+    used = trajectory.action_dim
     assert 0 <= start < stop <= length + 1, (start, stop, length)
     assert used <= width, (used, width)
     images = stop - start
-    action, reward = np.zeros((images, width), np.float32), np.zeros(images, np.float32)
+    action = np.zeros((images, width), np.float32)
+    reward = np.zeros(images, np.float32)
     is_first, is_terminal, known = np.zeros((3, images), bool)
     is_first[0] = True  # a window's first image starts a new state: no action led to it
     action[1:, :used] = trajectory.action[start : stop - 1, :used]
@@ -252,5 +254,5 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
 
 
 def stack_windows(windows: Sequence[dict[str, np.ndarray]]) -> Batch:
-    """Makes a Batch of equally long windows (see `led_to`)."""
+    """Make a Batch of equally long sequences, the results of `led_to`."""
     return Batch(**{k: torch.from_numpy(np.stack([w[k] for w in windows])) for k in STREAMS})

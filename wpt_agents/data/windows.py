@@ -27,8 +27,9 @@ class Windows:
     def __init__(self, lengths: np.ndarray) -> None:
         assert len(lengths) > 0
         self._images = np.asarray(lengths, np.int64) + 1
-        self._ends = (0, self._images)  # window length, (N,) cumulative counts; one object, so
-        # that threads drawing windows of different lengths do not mix them
+        # Window length and (N,) cumulative counts of such windows. One object, so that threads
+        # that draw windows of different lengths do not mix them.
+        self._ends = (0, self._images)
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
         """Draw the pieces of `batch_size` sequences; several each if trajectories are short."""
@@ -47,13 +48,16 @@ class Windows:
         ]
 
     def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> Row:
-        pieces = [(i, start, int(min(start + length, self._images[i])))]
-        missing = length - (pieces[0][2] - start)
-        while missing > 0:
+        """Return the piece from `start` on, and whole trajectories behind it until it is long."""
+        pieces = []
+        while True:
+            stop = int(min(start + length, self._images[i]))
+            pieces.append((i, start, stop))
+            length -= stop - start
+            if length == 0:
+                return pieces
             i = int(rng.integers(len(self._images)))
-            pieces.append((i, 0, int(min(missing, self._images[i]))))
-            missing -= pieces[-1][2]
-        return pieces
+            start = 0
 
 
 def make_batch(
@@ -83,11 +87,11 @@ def make_batch(
         for piece in rows[b]:
             trajectory, start, stop = read(piece)
             _check_width(trajectory, width)
-            for name, stream in led_to(trajectory, start, stop, width).items():
-                out[name][b, at : at + stop - start] = stream
+            streams = led_to(trajectory, start, stop, width)
             if background is not None:
-                seen = out["image"][b, at : at + stop - start]
-                out["moving"][b, at : at + stop - start] = moving_pixels(seen, background(piece[0]))
+                streams["moving"] = moving_pixels(streams["image"], background(piece[0]))
+            for name, stream in streams.items():
+                out[name][b, at : at + stop - start] = stream
             at += stop - start
 
     for _ in apply(fill, range(len(rows))):

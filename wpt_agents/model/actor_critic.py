@@ -184,6 +184,7 @@ class Actor(Head):
 
     :param size: the widths
     :param action_dim: the padded action width, A
+    :param outscale: factor on the initial weights of the last layer
     """
 
     def __init__(self, size: Size, action_dim: int, outscale: float = 1.0) -> None:
@@ -212,6 +213,8 @@ class Actor(Head):
 class Critic(Head):
     """v(V | s): a distribution over returns, two-hot in symlog space.
 
+    :param size: the widths
+    :param zero_init: start with the value 0 everywhere
     :param bin_range: of the bins, in symlog space
     """
 

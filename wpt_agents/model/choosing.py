@@ -1,4 +1,4 @@
-"""How actor and clone act together: by the value of where their actions lead, or by their sum.
+"""How actor and prior actor act together: by the value of their actions, or by their sum.
 
 The choice is that of imitation-bootstrapped RL (IBRL, https://arxiv.org/abs/2311.02198). IBRL asks
 a Q-function; here the world model imagines the step. Values include the reward on arriving (Eq. 2),
@@ -55,12 +55,12 @@ def value_of_action(rssm: RSSM, critic: Critic, state: Latent, action: Tensor) -
     return critic.value(states.feat[:, 1])
 
 
-def actor_or_clone(policy: Chooser, state: Latent, action: Tensor, frames: Tensor) -> Tensor:
-    """Return the actor's action, or the clone's where the target critic expects more of it.
+def actor_or_prior(policy: Chooser, state: Latent, action: Tensor, frames: Tensor) -> Tensor:
+    """Return the actor's action, or the prior actor's where the target critic prefers it.
 
     :param state: (N, ...), where to act
     :param action: (N, A), the actor's
-    :param frames: (N, F, 64, 64, 3) uint8, what the clone sees
+    :param frames: (N, F, 64, 64, 3) uint8, what the prior actor sees
     """
     proposal = policy.prior_actor.act(frames, policy.action_mask)
     rssm = policy.world_model.rssm
@@ -71,19 +71,19 @@ def actor_or_clone(policy: Chooser, state: Latent, action: Tensor, frames: Tenso
 def corrected(
     policy: Chooser, dist: TruncatedNormal, state: Latent, frames: Tensor
 ) -> TruncatedNormal:
-    """Return the actor's distribution around the clone's action instead of its imitation of it.
+    """Return the actor's distribution around the prior actor's action, not its imitation of it.
 
-    The mean is the clone's action plus what imagination has changed: the difference between the
-    actor and an actor that only imitates the clone. Where they agree, and before imagination, the
-    clone acts, and not an imitation of it from latent states, which lack details of the images.
+    The mean is the prior actor's action plus what imagination has changed: the difference between
+    the actor and an imitator of the prior actor. Where these agree, as before imagination, the
+    prior actor acts, and not an imitation from latent states, which lack details of the images.
     Source of learning corrections to a policy: https://arxiv.org/abs/1812.06298
 
     :param dist: the actor's, (N, A)
     :param state: (N, ...), where to act
-    :param frames: (N, F, 64, 64, 3) uint8, what the clone sees
+    :param frames: (N, F, 64, 64, 3) uint8, what the prior actor sees
     """
     mask = policy.action_mask
-    clone = policy.prior_actor.act(frames, mask)
+    prior_action = policy.prior_actor.act(frames, mask)
     imitator = policy.imitator
     imitation = dist.mean if imitator is None else imitator.dist(state.feat, mask).mean
-    return TruncatedNormal((clone + (dist.mean - imitation)).clamp(-1, 1), dist.std, mask)
+    return TruncatedNormal((prior_action + (dist.mean - imitation)).clamp(-1, 1), dist.std, mask)

@@ -49,7 +49,8 @@ class CriticEnsemble(nn.Module):
         self, embed_dim: int, features: int, hidden: int, action_dim: int, members: int
     ) -> None:
         super().__init__()
-        self.trunk, self.members = Trunk(embed_dim, features), members
+        self.trunk = Trunk(embed_dim, features)
+        self.members = members
         self.layers = nn.Sequential(
             EnsembleLinear(members, features + action_dim, hidden),
             EnsembleNorm(members, hidden),

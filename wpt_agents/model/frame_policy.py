@@ -48,7 +48,7 @@ class FramePolicy(PixelPolicy):
         return self.action_space.shape[0]
 
     def reset_behavior(self) -> None:
-        """Draws all networks that belong to a task."""
+        """Draw new weights for all networks, which belong to a task."""
         device = self.device
         mask = torch.ones(self.action_dim, dtype=torch.bool)
         self.register_buffer("action_mask", mask, persistent=False)
@@ -58,24 +58,24 @@ class FramePolicy(PixelPolicy):
         self.to(device)
 
     def build(self) -> None:
-        """Draws the networks for actions of width `action_dim`."""
+        """Make the networks for actions of width `action_dim`."""
         raise NotImplementedError
 
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
     ) -> Tensor:
-        """The actions: (N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1]."""
+        """Return the actions: (N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1]."""
         raise NotImplementedError
 
     def set_action_space(self, action_space: spaces.Box) -> None:
-        """Acts in this space from now on."""
+        """Act in this space from now on; another width needs new networks."""
         width = self.action_dim
         self.action_space = action_space
         if self.action_dim != width:
             self.reset_behavior()
 
     def initial_state(self, n: int) -> State:
-        """The acting state of n fresh episodes: the last images, (n, F, 64, 64, 3)."""
+        """Return the acting state of n new episodes: the last images, (n, F, 64, 64, 3)."""
         return (np.zeros((n, FRAMES, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8),)
 
     @torch.inference_mode()
@@ -87,7 +87,7 @@ class FramePolicy(PixelPolicy):
         deterministic: bool = False,
         generator: Generator | None = None,
     ) -> tuple[np.ndarray, State]:
-        """One action for each environment.
+        """Return one action for each environment, and the next state.
 
         :param image: (n, 64, 64, 3) uint8
         :param state: from the step before, or None
@@ -105,7 +105,7 @@ class FramePolicy(PixelPolicy):
         return action.cpu().numpy(), (frames,)
 
     def executed(self, state: State, action: np.ndarray) -> State:
-        """The state after another action than the policy's was taken: it holds no actions."""
+        """Return the state after `action` was executed, which it does not depend on."""
         return state
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -34,11 +34,12 @@ class FrameEncoder(nn.Module):
         assert len(channels) == len(strides), (channels, strides)
         self.centre = centre
         self.differences = differences
-        inputs, side = [3 * frames, *channels[:-1]], IMAGE_SIZE
+        inputs = [3 * frames, *channels[:-1]]
         self.layers = nn.ModuleList(
             nn.Conv2d(i, o, 3, stride)
             for i, o, stride in zip(inputs, channels, strides, strict=True)
         )
+        side = IMAGE_SIZE
         for stride in strides:
             side = (side - 3) // stride + 1
         self.embed_dim = channels[-1] * side**2

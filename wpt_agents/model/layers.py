@@ -88,7 +88,13 @@ class UpConv(nn.ConvTranspose2d):
 
 
 class Head(nn.Module):
-    """An MLP over s = [h, z]: the sum of a layer of h and one of z, then `layers` hidden layers."""
+    """An MLP over s = [h, z]: the sum of a layer of h and one of z, then `layers` hidden layers.
+
+    :param size: the widths
+    :param layers: number of hidden layers
+    :param outputs: width of the output
+    :param zero_init: start with the output 0 everywhere
+    """
 
     def __init__(self, size: Size, layers: int, outputs: int, zero_init: bool = False) -> None:
         super().__init__()

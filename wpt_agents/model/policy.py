@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
 from wpt_agents.model.actor_critic import Actor, Critic, ema_update
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
-from wpt_agents.model.choosing import actor_or_clone, corrected
+from wpt_agents.model.choosing import actor_or_prior, corrected
 from wpt_agents.model.distributions import BIN_RANGE, Noise
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.observations import (
@@ -87,24 +87,25 @@ class WPTPolicy(PixelPolicy):
         self.actor_outscale = actor_outscale
         self.bin_range = bin_range
         self.world_model = WorldModel(size, max_action_dim, unimix, zero_init_heads, bin_range)
-        self.register_buffer("action_mask", torch.zeros(max_action_dim, dtype=torch.bool), False)
+        mask = torch.zeros(max_action_dim, dtype=torch.bool)
+        self.register_buffer("action_mask", mask, persistent=False)
         self.register_buffer("return_scale", torch.zeros(()))
         self.reset_behavior()
         self.world_model.make_reward_members(range(reward_ensemble - 1))
         if continue_head:
-            self.world_model.make_continue_head(0.0, 0)
+            self.world_model.make_continue_head(log_odds=0.0, seed=0)
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
-        """Draw new weights for all that belongs to a task: reward head, actor, critic, clone."""
+        """Draw new weights for all that belongs to a task: reward head, actors, critics."""
         size = self.size
         device = self.device
         self.world_model.reset_reward_head()
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
         self.critic = Critic(size, self.zero_init_heads, self.bin_range).to(device)
-        self.target_critic = Critic(size, False, self.bin_range).to(device).requires_grad_(False)
-        self.target_critic.load_state_dict(self.critic.state_dict())
+        self.target_critic = Critic(size, bin_range=self.bin_range).to(device)
+        self.target_critic.requires_grad_(False).load_state_dict(self.critic.state_dict())
         self.average_actor = None
         self.imitator = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
@@ -192,19 +193,19 @@ class WPTPolicy(PixelPolicy):
         # The authors draw the latent even if the action is deterministic.
         post, outputs = acting_step(self, *inputs, generator, not deterministic)
         dist = self.acting_actor.truncated(outputs, self.action_mask)
-        seen: list[np.ndarray] = []
+        frames: list[np.ndarray] = []  # of the prior actor, if it takes part
         if self.sees_frames:
-            seen = [stack_frames(image, state[2] if state else None, first)]
+            frames = [stack_frames(image, state[2] if state else None, first)]
         if self.residual:
-            dist = corrected(self, dist, post, self._tensor(seen[0]))
-        action = dist.mode if deterministic else dist.rsample(generator)
+            dist = corrected(self, dist, post, self._tensor(frames[0]))
+        decision = dist.mode if deterministic else dist.rsample(generator)
         if self.ibrl:
-            action = actor_or_clone(self, post, action, self._tensor(seen[0]))
-        latent = [x.cpu().numpy() for x in post]
-        state = (*latent, *seen, action.cpu().numpy())
-        if not np.isfinite(state[-1]).all():
+            decision = actor_or_prior(self, post, decision, self._tensor(frames[0]))
+        action = decision.cpu().numpy()
+        if not np.isfinite(action).all():
             raise ValueError("The actor's output is not finite: the weights are damaged")
-        return state[-1], state
+        latent = [x.cpu().numpy() for x in post]
+        return action, (*latent, *frames, action)
 
     def _with_frames(self, state: State, image: np.ndarray) -> State:
         """Add or remove the images of a state, so that keywords can change within an episode."""
@@ -229,6 +230,7 @@ class WPTPolicy(PixelPolicy):
         """Imagine with the actor in the frozen world model; gradients run through the dynamics.
 
         :param start: (N, ...), the states to start from
+        :param horizon: H
         """
         with frozen(self.world_model):
             return imagine(self, start.detach(), horizon, generator)
@@ -311,7 +313,7 @@ def acting_step(
 
 @op
 def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None) -> Dream:
-    """Imagine with the actor from N states."""
+    """Imagine `horizon` steps with the actor, from N states (N, ...)."""
     entropies: list[Tensor] = []
     saturated: list[Tensor] = []
 

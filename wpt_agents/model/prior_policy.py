@@ -10,7 +10,7 @@ from wpt_agents.model.behavior_cloning import PriorActor
 from wpt_agents.model.observations import Observation, State, stack_frames, to_images
 
 
-class HasClone(Protocol):
+class HasPriorActor(Protocol):
     """A policy with a prior actor."""
 
     image_key: str | None  # the entry to see of Dict observations
@@ -28,7 +28,7 @@ class HasClone(Protocol):
 class PriorPolicy:
     """The prior actor with SB3's `predict`; its state is the last three images."""
 
-    def __init__(self, policy: HasClone) -> None:
+    def __init__(self, policy: HasPriorActor) -> None:
         self.policy = policy
 
     def predict(
@@ -53,7 +53,7 @@ class PriorPolicy:
 
 
 @torch.no_grad()
-def prior_action(policy: HasClone, frames: np.ndarray) -> np.ndarray:
+def prior_action(policy: HasPriorActor, frames: np.ndarray) -> np.ndarray:
     """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
     images = torch.from_numpy(frames).to(policy.device)
     return np.asarray(policy.prior_actor.act(images, policy.action_mask).cpu())

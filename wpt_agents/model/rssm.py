@@ -149,7 +149,8 @@ class RSSM(nn.Module):
         :param embed: (B, T, E), the encoded images
         :param action: (B, T, A), the action that led to each image
         :param is_first: (B, T) bool, where state and previous action are reset to zero
-        :param state: the state before the first image; zeros if None
+        :param state: the state before the first image, (B, ...); zeros if None
+        :param generator: source of the random numbers; torch's own if None
         :param sample: draw z; if False, take the most likely class of each group
         :return: the posterior Latent (B, T, ...), and post_logits, prior_logits (B, T, S, K)
         """
@@ -166,15 +167,9 @@ class RSSM(nn.Module):
         generator: Noise = None,
         sample: bool = True,
     ) -> tuple[Latent, Tensor]:
-        """`observe` without the prior, which acting does not need.
+        """`observe` without the prior, which acting does not need; the parameters are the same.
 
-        :param embed: (B, T, E)
-        :param action: (B, T, A), what led to each image
-        :param is_first: (B, T) bool
-        :param state: the latent before the first step, of B rows; zeros if None
-        :param generator: source of the random numbers
-        :param sample: draw z; False takes the most likely classes
-        :return: the posterior latents and their logits (B, T, S, K)
+        :return: the posterior Latent (B, T, ...), and post_logits (B, T, S, K)
         """
         batch, length = is_first.shape
         assert embed.shape[:2] == action.shape[:2] == (batch, length), (embed.shape, action.shape)
@@ -198,6 +193,9 @@ class RSSM(nn.Module):
 
         :param state: where to start, (N, ...)
         :param policy: (state, t) -> action (N, A)
+        :param horizon: H
+        :param generator: source of the random numbers; torch's own if None
+        :param sample: draw z; if False, take the most likely class of each group
         :return: the states at the steps 0 .. H, (N, H + 1, ...), the first being `state`, and the
             actions taken at the steps 0 .. H - 1, (N, H, A)
         """

@@ -62,7 +62,8 @@ class Size:
     guidance: str | float = "linear(1,0,50000)"
 
     def __post_init__(self) -> None:
-        for name in ("deter", "hidden", "stoch", "classes", "depth", "units", "blocks"):
+        widths = ("deter", "hidden", "stoch", "classes", "depth", "units", "blocks")
+        for name in (*widths, "pretrain_steps"):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"Size.{name} must be a whole number of at least 1, got {value!r}")
@@ -70,11 +71,6 @@ class Size:
             value = getattr(self, name)
             if value * factor % self.blocks:
                 raise ValueError(f"Size.{name}={value} cannot be divided into {self.blocks} blocks")
-        steps = self.pretrain_steps
-        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
-            raise ValueError(
-                f"Size.pretrain_steps must be a whole number of at least 1, got {steps!r}"
-            )
         if self.gates not in GATES:
             raise unknown_name("gate layout", self.gates, GATES)
         for name in ("norm_eps", "learning_rate", "actor_critic_learning_rate"):
@@ -90,6 +86,7 @@ class Size:
 #:
 #: :meta hide-value:
 SIZES = {
+    # deter, hidden, stoch, classes, depth, units; learning rates of world model and of actor-critic
     "debug": Size(
         *(64, 32, 8, 8, 4, 32, 1e-3, 1e-3),
         pretrain_steps=200,

@@ -176,12 +176,12 @@ class WorldModel(nn.Module):
     @property
     def heads(self) -> list[nn.Module]:
         """All heads, which belong to a task."""
-        last = [] if self.continue_head is None else [self.continue_head]
-        return [self.reward_head, *self.reward_members, *last]
+        heads: list[nn.Module] = [self.reward_head, *self.reward_members]
+        return heads if self.continue_head is None else [*heads, self.continue_head]
 
     def make_reward_members(self, seeds: Sequence[int]) -> None:
         """Replace the further reward heads by new ones, each drawn with a seed of its own."""
-        heads = [self._own_head(BINS, self.zero_init_heads, seed) for seed in seeds]
+        heads = [self._seeded_head(BINS, self.zero_init_heads, seed) for seed in seeds]
         self.reward_members = nn.ModuleList(heads)
 
     def make_continue_head(self, log_odds: float, seed: int) -> None:
@@ -190,10 +190,10 @@ class WorldModel(nn.Module):
         :param log_odds: of going on, before anything is learned
         :param seed: of its random numbers
         """
-        self.continue_head = self._own_head(1, True, seed)
+        self.continue_head = self._seeded_head(1, zero_init=True, seed=seed)
         nn.init.constant_(self.continue_head.layers[-1].get_parameter("bias"), log_odds)
 
-    def _own_head(self, outputs: int, zero_init: bool, seed: int) -> Head:
+    def _seeded_head(self, outputs: int, zero_init: bool, seed: int) -> Head:
         """Make a head from random numbers of its own, so that no other network changes."""
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
@@ -278,8 +278,9 @@ class WorldModel(nn.Module):
         horizon = action.shape[1] - context
         dream, _ = self.rssm.imagine(last, lambda _, t: action[:, context + t], horizon, generator)
         # the dream's first state is the last filtered one
-        states = Latent(*(torch.cat([p, d[:, 1:]], 1) for p, d in zip(post, dream, strict=True)))
-        return to_uint8(self.decode(states))
+        deter = torch.cat([post.deter, dream.deter[:, 1:]], 1)
+        stoch = torch.cat([post.stoch, dream.stoch[:, 1:]], 1)
+        return to_uint8(self.decode(Latent(deter, stoch)))
 
 
 def world_model_update_loss(

@@ -32,7 +32,7 @@ def descend(optimizer: Optimizer, loss: Tensor, name: str, grad_clip: float = in
     :raises FloatingPointError: a loss or gradient that is not finite; the weights stay as they were
     """
     optimizer.zero_grad()
-    torch.autograd.backward(loss)
+    loss.backward()
     return take_step(optimizer, loss, name, grad_clip)
 
 

@@ -33,14 +33,9 @@ def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance")
     number = r"([-+0-9.eE_]+)"
     match = re.fullmatch(rf"linear\({number},{number},{number}\)", str(text).replace(" ", ""))
     try:
-        if match:
-            start, end, duration = (float(group) for group in match.groups())
-            if duration > 0 and all(0 <= x <= most and x < math.inf for x in (start, end)):
-                return linear(start, end, duration)
-        else:
-            constant = float(text)
-            if 0 <= constant <= most and constant < math.inf:
-                return lambda step: constant
+        start, end, duration = map(float, match.groups() if match else (text, text, 1))
+        if duration > 0 and all(0 <= x <= most and x < math.inf for x in (start, end)):
+            return linear(start, end, duration)
     except (ValueError, TypeError):
         pass
     to = f"to {most:g}" if most < math.inf else "on"

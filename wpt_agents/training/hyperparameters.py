@@ -13,7 +13,7 @@ import numpy as np
 from wpt_agents.model.behavior_cloning import FRAMES
 from wpt_agents.model.distributions import BIN_RANGE
 from wpt_agents.model.sizes import Size, find_size, plain_size
-from wpt_agents.training.guidance import ever, parse_schedule
+from wpt_agents.training.guidance import Schedule, ever, parse_schedule
 from wpt_agents.training.keywords import (
     Keywords,
     Stage,
@@ -344,14 +344,13 @@ class Hyperparameters(Keywords):
                 f"pessimism={self.pessimism!r} needs several reward heads, "
                 "but reward_ensemble=1: use reward_ensemble=3 or more, or pessimism=0"
             )
-        if self.imitates and self.batch_length < FRAMES:
-            raise ValueError(
-                f"kickstart needs {FRAMES} images in a row, but batch_length="
-                f"{self.batch_length}: use batch_length={FRAMES} or more, or kickstart=0"
-            )
-        head_start = self.actor_delay and self.needs_clone
-        if (head_start or self.residual) and self.batch_length < FRAMES:
-            name = "residual" if self.residual else "actor_delay"
+        imitating = {
+            "kickstart": self.imitates,
+            "residual": self.residual,
+            "actor_delay": self.actor_delay and self.needs_clone,
+        }
+        name = next((name for name, on in imitating.items() if on), None)
+        if name is not None and self.batch_length < FRAMES:
             raise ValueError(
                 f"{name} imitates the prior actor, which needs {FRAMES} images in a row, but "
                 f"batch_length={self.batch_length}: use batch_length={FRAMES} or more, or leave "
@@ -366,34 +365,37 @@ class Hyperparameters(Keywords):
     @property
     def pessimistic(self) -> bool:
         """Whether imagined rewards are ever lower than the mean of the reward heads."""
-        return ever(parse_schedule(self.pessimism, np.inf, "pessimism"))
-
-    def pessimism_at(self, step: int) -> float:
-        """Return what the reward heads' deviation is multiplied by at this step."""
-        return parse_schedule(self.pessimism, np.inf, "pessimism")(step)
+        return ever(self._schedule("pessimism"))
 
     @property
     def imitates(self) -> bool:
         """Whether the actor ever imitates the prior actor in its loss."""
-        return ever(parse_schedule(self.kickstart, np.inf, "kickstart"))
+        return ever(self._schedule("kickstart"))
 
     @property
     def needs_clone(self) -> bool:
         """Whether the prior actor will ever act or be imitated."""
-        guided = ever(parse_schedule(self.value("guidance")))
-        return self.imitates or self.ibrl or self.residual or guided
+        return self.imitates or self.ibrl or self.residual or ever(self._schedule("guidance"))
+
+    def pessimism_at(self, step: int) -> float:
+        """Return what the reward heads' deviation is multiplied by at this step."""
+        return self._schedule("pessimism")(step)
 
     def guidance_at(self, step: int) -> float:
         """Return the probability that an episode that begins at this step is guided."""
-        return parse_schedule(self.value("guidance"))(step)
+        return self._schedule("guidance")(step)
 
     def ent_coef_at(self, step: int) -> float:
         """Return the weight of the entropy at this step."""
-        return parse_schedule(self.ent_coef, np.inf, "ent_coef")(step)
+        return self._schedule("ent_coef")(step)
 
     def kickstart_at(self, step: int) -> float:
         """Return the weight of the imitation loss at this step."""
-        return parse_schedule(self.kickstart, np.inf, "kickstart")(step)
+        return self._schedule("kickstart")(step)
+
+    def _schedule(self, name: str) -> Schedule:
+        """Return a keyword as a function of the step; its range was checked before."""
+        return parse_schedule(self.value(name), np.inf, name)
 
 
 FINE_TUNING = Hyperparameters.of_stages(*(set(Stage) - {Stage.SIZE, Stage.PRETRAINING}))

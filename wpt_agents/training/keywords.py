@@ -242,12 +242,12 @@ class Keywords:
 
     def chosen(self) -> dict[str, Any]:
         """Return the keywords that differ from their defaults, and all that the size decides."""
-        values = {item.name: (self.value(item.name), item.default) for item in fields(self)}
-        return {
-            name: value
-            for name, (value, default) in values.items()
-            if value != default or name in self.sizes_own
-        }
+        chosen = {}
+        for item in fields(self):
+            value = self.value(item.name)
+            if value != item.default or item.name in self.sizes_own:
+                chosen[item.name] = value
+        return chosen
 
     def changed(self, **changes: Any) -> Self:
         """Return a copy in which some keywords have other values, which are checked."""

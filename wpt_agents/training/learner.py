@@ -59,11 +59,16 @@ class Learner(WorldModelLearner):
 
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
-        rate = self.hyperparameters.value("actor_critic_learning_rate")
+        rate = self.actor_critic_rate
         self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
         self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
         self.add_imitator()
         self.step = 0  # collected steps, by which schedules go
+
+    @property
+    def actor_critic_rate(self) -> float:
+        """The learning rate of actor, critic and imitator."""
+        return float(self.hyperparameters.value("actor_critic_learning_rate"))
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
         """Use other hyperparameters from now on; the optimisers keep their averages."""
@@ -72,7 +77,7 @@ class Learner(WorldModelLearner):
 
     def set_actor_critic_rate(self, share: float) -> None:
         """Set the learning rates of actor and critic to a share of their keyword."""
-        rate = share * self.hyperparameters.value("actor_critic_learning_rate")
+        rate = share * self.actor_critic_rate
         self.set_rate(self.actor_optimizer, rate)
         self.set_rate(self.critic_optimizer, rate)
         if self.imitator_optimizer is not None:
@@ -82,8 +87,8 @@ class Learner(WorldModelLearner):
         """Make an optimiser of the policy's imitator, if it has one."""
         self.imitator_optimizer: Optimizer | None = None
         if imitator := self.policy.imitator:
-            rate = self.hyperparameters.value("actor_critic_learning_rate")
-            self.imitator_optimizer = self.adam([list(imitator.parameters())], rate)
+            parts = [list(imitator.parameters())]
+            self.imitator_optimizer = self.adam(parts, self.actor_critic_rate)
 
     def update(
         self,
@@ -97,30 +102,33 @@ class Learner(WorldModelLearner):
         :param imitation_weight: of the loss by which the actor imitates the prior actor
         :param head_start: train the actor on nothing but that imitation
         """
-        imitator = self.policy.imitator if self.hyperparameters.residual else None
+        settings = self.hyperparameters
+        imitator = self.policy.imitator if settings.residual else None
         advice = self.advice(batch) if imitation_weight or imitator is not None else None
         states_loss = None
-        if advice is not None and imitation_weight and self.hyperparameters.imitation_grad:
+        if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
-        post, metrics = self.update_world_model(batch, generator, True, states_loss)
+        post, metrics = self.update_world_model(
+            batch, generator, learn_reward=True, states_loss=states_loss
+        )
         metrics |= self.update_continue_head(post, batch)
-        imitation = None
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
             loss = self.imitation_loss(imitator, post, advice)
             self.descend(self.imitator_optimizer, loss, "imitator")
+        imitation = None
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
-        starts = self.draw_starts(batch, generator)
-        start = post.flatten_time().pick(starts)
-        grounding = None
-        if self.hyperparameters.repval_scale:
+        replay_loss = None
+        if settings.repval_scale:
             loss = self.replay_value_loss(post, batch)
             metrics["train/replay_value_loss"] = loss.detach()
-            grounding = self.hyperparameters.repval_scale * loss
-        metrics |= self.update_behavior(start, starts, generator, imitation, head_start, grounding)
-        return metrics
+            replay_loss = settings.repval_scale * loss
+        index = self.draw_starts(batch, generator)
+        start = post.flatten_time().pick(index)
+        behavior = self.update_behavior(start, index, generator, imitation, head_start, replay_loss)
+        return metrics | behavior
 
     @torch.no_grad()
     def advice(self, batch: Batch) -> Tensor:
@@ -169,7 +177,7 @@ class Learner(WorldModelLearner):
             return replay_value_loss(logits, returns, batch.reward_known, bin_range)
 
     def draw_starts(self, batch: Batch, generator: Generator) -> Tensor:
-        """Return the numbers of the batch's states to imagine from, (N,)."""
+        """Return which of the flattened B x T states to imagine from, (N,)."""
         number = self.hyperparameters.value("imagine_starts")
         rows, length = batch.is_first.shape
         return draw_starts(rows, length, number, generator, self.policy.device)
@@ -177,11 +185,11 @@ class Learner(WorldModelLearner):
     def update_behavior(
         self,
         start: Latent,
-        starts: Tensor,
+        index: Tensor,
         generator: Generator,
         imitation: Tensor | None = None,
         head_start: bool = False,
-        grounding: Tensor | None = None,
+        replay_loss: Tensor | None = None,
     ) -> Metrics:
         """Train actor and critic on imagined trajectories, Eq. (2) to (4).
 
@@ -189,55 +197,72 @@ class Learner(WorldModelLearner):
         prior actor it is not updated: reward head and critic learn first.
 
         :param start: (N, ...), the states to start from
-        :param starts: (N,), their numbers in the batch
+        :param index: (N,), where they are in the flattened batch
         :param imitation: added to the actor's loss, but not to the metric of it
-        :param grounding: added to the critic's loss, but not to the metric of it
+        :param replay_loss: added to the critic's loss, but not to the metric of it
+        """
+        through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
+        with self.autocast(), torch.set_grad_enabled(through_dream):
+            imagined = self.imagine(start, index, generator)
+        spread, scale = self.return_scale(imagined.returns)
+        metrics = self.update_actor(imagined, scale, imitation, head_start)
+        metrics |= self.update_critic(imagined, replay_loss)
+        self.policy.return_scale.copy_(spread)  # now that it is known to be finite
+        return metrics | {
+            "train/value": imagined.value.detach().mean(),
+            "train/imagined_reward": imagined.reward.detach().mean(),
+            "train/entropy": imagined.dream.entropy.detach().mean(),
+            "train/saturated_actions": imagined.dream.saturated,
+            "train/return_scale": scale,
+        }
+
+    def update_actor(
+        self, imagined: Imagined, scale: Tensor, imitation: Tensor | None, head_start: bool
+    ) -> Metrics:
+        """Take a step on Eq. (4) and the imitation, or in the head start on the imitation alone.
+
+        :param scale: what returns are divided by
+        :param imitation: added to the loss, but not to the metric of it
+        """
+        # In a new context: torch before 2.11 would use the weights again that it has cast in the
+        # dream, without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
+        with self.autocast():
+            loss = self.actor_loss(imagined, scale)
+        if head_start:
+            total = imitation
+        else:
+            total = loss if imitation is None else loss + imitation
+        norm = torch.zeros_like(scale)
+        if total is not None:
+            norm = self.descend(self.actor_optimizer, total, "actor")
+        return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
+
+    def update_critic(self, imagined: Imagined, replay_loss: Tensor | None) -> Metrics:
+        """Take a step on Eq. (3), and move the target critic.
+
+        :param replay_loss: added to the loss, but not to the metric of it
         """
         policy = self.policy
         settings = self.hyperparameters
-        through_dream = settings.actor_grad == "dynamics" and not head_start
-        with self.autocast(), torch.set_grad_enabled(through_dream):
-            imagined = self.imagine(start, starts, generator)
-        dream, reward, value, returns, goes_on = imagined
-        spread, scale = self.return_scale(returns)
-        # In a new context: torch before 2.11 would use the weights again that it has cast above,
-        # without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
+        gamma = settings.gamma
+        goes_on = imagined.goes_on
+        bin_range = policy.bin_range
         with self.autocast():
-            loss = self.actor_loss(imagined, scale)
-        terms = [] if head_start else [loss]
-        terms += [] if imitation is None else [imitation]
-        actor_norm = torch.zeros_like(scale)
-        if terms:
-            actor_norm = self.descend(self.actor_optimizer, sum(terms[1:], terms[0]), "actor")
-        with self.autocast():
-            logits = over_steps(policy.critic, dream.states.detach().but_last())
-            bins = policy.bin_range
-            value_loss = critic_loss(logits, returns, settings.gamma, goes_on, bins)
-            total = value_loss if grounding is None else value_loss + grounding
+            logits = over_steps(policy.critic, imagined.dream.states.detach().but_last())
+            loss = critic_loss(logits, imagined.returns, gamma, goes_on, bin_range)
+            total = loss if replay_loss is None else loss + replay_loss
             if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
-                slow = critic_loss(logits, value[:, :-1], settings.gamma, goes_on, bins)
+                slow = critic_loss(logits, imagined.value[:, :-1], gamma, goes_on, bin_range)
                 total = total + settings.slow_critic_scale * slow
-        critic_norm = self.descend(self.critic_optimizer, total, "critic")
-        policy.return_scale.copy_(spread)  # now that it is known to be finite
+        norm = self.descend(self.critic_optimizer, total, "critic")
         ema_update(policy.target_critic, policy.critic, settings.target_fraction)
-        metrics = {
-            "actor_loss": loss,
-            "critic_loss": value_loss,
-            "value": value.mean(),
-            "imagined_reward": reward.mean(),
-            "entropy": dream.entropy.mean(),
-            "saturated_actions": dream.saturated,
-            "return_scale": scale,
-            "actor_grad_norm": actor_norm,
-            "critic_grad_norm": critic_norm,
-        }
-        return {f"train/{name}": tensor.detach() for name, tensor in metrics.items()}
+        return {"train/critic_loss": loss.detach(), "train/critic_grad_norm": norm}
 
-    def imagine(self, start: Latent, starts: Tensor, generator: Generator) -> Imagined:
+    def imagine(self, start: Latent, index: Tensor, generator: Generator) -> Imagined:
         """Dream from some states and compute what the dreams are worth, Eq. (2)."""
         settings = self.hyperparameters
         dream = self.policy.dream(start, settings.imagine_horizon, generator)
-        reward = self.imagined_reward(dream, starts)
+        reward = self.imagined_reward(dream, index)
         value = over_steps(self.policy.target_critic.value, dream.states)
         goes_on = self.imagined_continue(dream)
         returns = lambda_return(reward, value, settings.gamma, settings.lam, goes_on)
@@ -268,10 +293,11 @@ class Learner(WorldModelLearner):
             scale,
         )
 
-    def imagined_reward(self, dream: Dream, starts: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
         """Return the rewards of arriving in the imagined states 0 .. H-1, (N, H).
 
-        :param starts: (N,), the numbers of the starting states in the batch
+        :param index: (N,), where the dreams start in the flattened batch; rewards by the heads do
+            not depend on it, those of a subclass may
         """
         model = self.policy.world_model
         states = dream.states.but_last()

@@ -11,7 +11,8 @@ import numpy as np
 from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
-from wpt_agents.training.distributed import Divided, World
+from wpt_agents.training.distributed import World
+from wpt_agents.training.divided import Divided
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.logs import PretrainingLog
 from wpt_agents.training.progress import WorldModelProgress
@@ -23,7 +24,7 @@ from wpt_agents.training.world_model_learner import (
     world_model_metrics,
 )
 
-EVERY = 1000  # updates between two model files
+SAVE_EVERY = 1000  # updates between two model files
 
 Update = Callable[[Batch, int], Metrics]  # called with a batch and the update's number
 Callback = Callable[[int, dict[str, float]], Any]  # called with the updates made and the metrics
@@ -90,9 +91,9 @@ def pretrain(
 
 
 class Pretraining:
-    """What every `pretrain` does after each update: it counts, logs, saves, and stops when asked.
+    """Count, log and save the updates of pre-training, and stop it when asked.
 
-    With a run folder the model is saved every `EVERY` updates, at the end, and when Ctrl-C,
+    With a run folder the model is saved every `SAVE_EVERY` updates, at the end, and when Ctrl-C,
     SIGTERM or the callback stops it. It is never saved in the middle of an update, so that
     training that goes on from there equals training that was never stopped.
 
@@ -153,23 +154,24 @@ class Pretraining:
         self.signals.__exit__()
 
     def finish_update(self, metrics: Metrics) -> None:
-        """Do what follows an update."""
+        """Count an update and log it, call back, and save or stop where it is time."""
         agent = self.agent
         progress = agent.progress
         if self.log is None and self.world.rank == 0:  # not sooner: a refusal leaves no files
             before = progress.pretrain_steps
             self.log = PretrainingLog(self.run_dir, agent.tensorboard_log, agent.verbose, before)
         progress.pretrain_steps += 1
+        step = progress.pretrain_steps
         if self.log is not None:
             self.log.add(metrics)
         if self.callback is not None and self.world.rank == 0:
             try:
-                self.callback(progress.pretrain_steps, {k: float(v) for k, v in metrics.items()})
+                self.callback(step, {k: float(v) for k, v in metrics.items()})
             except (KeyboardInterrupt, SystemExit):
                 self._save()
                 raise
         stop = self.world.largest(self.signals.received, agent.device)
-        if stop or progress.pretrain_steps % EVERY == 0 or progress.pretrain_steps == self.steps:
+        if stop or step % SAVE_EVERY == 0 or step == self.steps:
             self._save()
             self.world.barrier()  # no process goes on, or ends, before the file is there
         if stop:

@@ -1,7 +1,7 @@
 """How far an agent has come: everything that its model file holds besides weights and keywords."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Self
 
 RENAMED = {"_windows_drawn": "windows_drawn", "_seen_length": "seen_length"}  # since version 0.1
@@ -61,10 +61,9 @@ class Progress:
 
     def reset(self, *names: str) -> None:
         """Set some counters back to their defaults."""
-        for item in fields(self):
-            if item.name in names:
-                made = item.default if item.default_factory is MISSING else item.default_factory()
-                setattr(self, item.name, made)
+        new = type(self)()
+        for name in names:
+            setattr(self, name, getattr(new, name))
 
 
 @dataclass(kw_only=True)

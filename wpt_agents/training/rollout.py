@@ -75,8 +75,8 @@ class Rollout:
         self.embodiment = embodiment
         self.state: State = policy.initial_state(n_envs)
         self.frames: np.ndarray | None = None
-        self.first = np.ones(n_envs, bool)  # an episode begins
-        self.begins = np.ones(n_envs, bool)  # a trajectory begins: an episode, or a part of one
+        self.episode_start = np.ones(n_envs, bool)
+        self.trajectory_start = np.ones(n_envs, bool)  # of an episode, or of a part of one
         self.opening: list[np.ndarray | None] = [None] * n_envs  # the first image of each episode
         self.windows: list[Window] = [(0, 0)] * n_envs
         self.images: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
@@ -89,13 +89,15 @@ class Rollout:
         :param image: (n, 64, 64, 3) uint8
         :return: (n, A) in [-1, 1]
         """
-        for i in np.flatnonzero(self.begins):
+        for i in np.flatnonzero(self.trajectory_start):
             self.windows[i] = self.draw_window()
-        for i in np.flatnonzero(self.first):
+        for i in np.flatnonzero(self.episode_start):
             self.opening[i] = image[i].copy()
         # Kept at every step, because the guide's window may begin at any.
-        self.frames = stack_frames(image, self.frames, self.first)
-        action, state = self.policy.act(image, self.state, self.first, generator=self.generator)
+        self.frames = stack_frames(image, self.frames, self.episode_start)
+        action, state = self.policy.act(
+            image, self.state, self.episode_start, generator=self.generator
+        )
         time = np.array([len(actions) for actions in self.actions])
         start, stop = np.array(self.windows).T
         guided = (start <= time) & (time < stop)
@@ -137,13 +139,13 @@ class Rollout:
             self.rewards[i].append(float(value))
             if i in last:
                 finished.append(self._finish(i, *last[i]))
-        self.first = done.copy()
-        self.begins = np.array([i in last for i in range(len(reward))])
+        self.episode_start = done.copy()
+        self.trajectory_start = np.array([i in last for i in range(len(reward))])
         return finished
 
     def first_image(self, i: int) -> np.ndarray | None:
         """Return the first image of an open episode, None before its first step."""
-        return None if self.first[i] else self.opening[i]
+        return None if self.episode_start[i] else self.opening[i]
 
     def _finish(self, i: int, image: np.ndarray, terminated: bool) -> Trajectory:
         trajectory = Trajectory(

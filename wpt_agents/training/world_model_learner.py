@@ -129,13 +129,13 @@ class WorldModelLearner:
     def update_continue_head(self, post: Latent, batch: Batch) -> Metrics:
         """Take a step on the continue head, if there is one, on the rows of the task itself."""
         head = self.policy.world_model.continue_head
-        is_off = not self.hyperparameters.continue_head
-        if head is None or self.continue_optimizer is None or is_off:
+        optimizer = self.continue_optimizer
+        if head is None or optimizer is None or not self.hyperparameters.continue_head:
             return {}
         known = batch.reward_known.any(1, keepdim=True).expand_as(batch.is_terminal)
         with self.autocast():
             loss = continue_loss(head(post.feat).squeeze(-1), batch.is_terminal, known)
-        self.descend(self.continue_optimizer, loss, "continue")
+        self.descend(optimizer, loss, "continue")
         return {"train/continue_loss": loss.detach()}
 
     @property

@@ -270,7 +270,7 @@ def test_a_wait_for_another_process_pretraining_ends_in_its_model(tmp_path, monk
 
 
 def test_the_log_of_a_pretraining_that_goes_on_has_each_row_once(tmp_path, monkeypatch):
-    monkeypatch.setattr("wpt_agents.training.pretraining.EVERY", 100)
+    monkeypatch.setattr("wpt_agents.training.pretraining.SAVE_EVERY", 100)
     shared, update = job(tmp_path, pretrain={"steps": 300}).shared, Learner.update_world_model
     dataset, taken = collect_data(shared), []
 

@@ -1,0 +1,133 @@
+"""Eq. (1) on a batch whose gradients several processes or several passes compute.
+
+Whoever computes a row, its random draws and the clip of its KL are those of the whole batch, so
+that losses and weights are those of one process to rounding.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from wpt_agents.data.trajectory import Batch
+from wpt_agents.model.distributions import Share, kl_one_hot
+from wpt_agents.model.layers import frozen
+from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_loss
+from wpt_agents.training.distributed import World
+
+
+class Divided:
+    """Eq. (1) on batches that are divided over processes, and in each over several passes.
+
+    :param model: every process's copy; they become equal
+    :param passes: over each process's share, to save memory
+    :param batch_size: rows of the whole batch
+    :param autocast: what a forward pass runs in
+    :param options: `Learner.eq_1_options`
+    :raises ValueError: a batch that cannot be divided so
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        world: World,
+        passes: int,
+        batch_size: int,
+        autocast: Callable[[], AbstractContextManager[None]],
+        options: dict[str, Any],
+    ) -> None:
+        if passes < 1 or batch_size % (world.size * passes):
+            raise ValueError(
+                f"batch_size={batch_size} cannot be divided over {world.size} processes of "
+                f"accumulate={passes} passes each: it must be a multiple of their product"
+            )
+        self.model = model
+        self.world = world
+        self.passes = passes
+        self.batch_size = batch_size
+        self.autocast = autocast
+        self.options = options
+        self.objective: nn.Module = _Objective(model, options)
+        if world.size > 1:
+            with frozen(*model.heads):  # DDP waits for the gradients of all else
+                self.objective = DistributedDataParallel(self.objective)
+
+    def backward(self, share: Batch, device: torch.device, seed: int) -> WorldModelLoss:
+        """Add the whole batch's gradients to the weights' gradients and return its losses.
+
+        :param share: this process's rows, `World.share` of them
+        :param seed: of the random draws, the same in all processes
+        """
+        parts = [part.to(device) for part in share.split(self.passes)]
+        whole = self._whole_kl(parts, seed)
+        losses = []
+        for i, part in enumerate(parts):
+            with self._in_step(last=i + 1 == self.passes):
+                with self.autocast():
+                    loss = self.objective(part, self._draws(part, i, seed), whole)
+                # Passes have equally many rows, so the mean of their losses is the batch's.
+                (loss.total / self.passes).backward()
+            losses.append(torch.stack([term.detach() for term in loss]))
+        return WorldModelLoss(*self.world.mean(torch.stack(losses).mean(0)))
+
+    def _draws(self, part: Batch, i: int, seed: int) -> Share:
+        first = (self.world.rank * self.passes + i) * len(part.image)
+        generator = Share(part.image.device, self.batch_size, first)
+        generator.manual_seed(seed)
+        return generator
+
+    def _in_step(self, last: bool) -> AbstractContextManager[None]:
+        """Return a context in which gradients are added up over processes in the last pass only."""
+        if last or not isinstance(self.objective, DistributedDataParallel):
+            return nullcontext()
+        return self.objective.no_sync()
+
+    @torch.no_grad()
+    def _whole_kl(self, parts: list[Batch], seed: int) -> Callable[[Tensor], Tensor]:
+        """Return a function that turns a part's mean KL into the whole batch's.
+
+        The first of several passes needs to know the KL of all, which costs each part one more way
+        through encoder and RSSM.
+        """
+        if self.passes == 1 or self.options["free_nats_mode"] != "mean":
+            return self.world.mean
+        kls = []
+        for i, part in enumerate(parts):
+            with self.autocast():
+                _, post, prior = self.model.observe(part, self._draws(part, i, seed))
+            kls.append(kl_one_hot(post, prior).mean())
+        kl = self.world.mean(torch.stack(kls).mean())
+        return lambda _: kl
+
+
+class _Objective(nn.Module):
+    """Eq. (1) of a part of a batch, as the forward pass that DistributedDataParallel needs."""
+
+    def __init__(self, model: WorldModel, options: dict[str, Any]) -> None:
+        super().__init__()
+        self.model = model
+        self.options = options
+
+    def forward(
+        self, batch: Batch, draws: Share, whole: Callable[[Tensor], Tensor]
+    ) -> WorldModelLoss:
+        post, post_logits, prior_logits = self.model.observe(batch, draws)
+        options = dict(self.options)
+        error = self.model.batch_error(post, batch, options.pop("pixel_weight"))
+        if options["free_nats_mode"] == "mean":
+            kl = kl_one_hot(post_logits, prior_logits).mean().detach()
+            options["free_nats"] = part_free_nats(options["free_nats"], kl, whole(kl))
+        return world_model_loss(error, post_logits, prior_logits, **options)
+
+
+def part_free_nats(free_nats: float, part_kl: Tensor, whole_kl: Tensor) -> Tensor:
+    """Return the free nats that clip the mean KL of a part where the whole batch's is clipped.
+
+    With f free nats, Eq. (1) takes max(f, kl) of the whole batch's KL. A part with the KL k takes
+    max(f + k - kl, k) = max(f, kl) + k - kl instead: it is clipped exactly where the whole is, and
+    as the mean of all k is kl, the mean over all parts is max(f, kl).
+    """
+    return free_nats + part_kl - whole_kl

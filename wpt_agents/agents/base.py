@@ -41,9 +41,9 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
-from wpt_agents.training.environments import last_reset
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
+from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout, Window, last_images, step_all
 
 Metrics = dict[str, list[Tensor]]
@@ -146,7 +146,7 @@ class PixelAgent(SavedAgent):
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
         if reset_num_timesteps:
             self.progress.restart_steps()
-        if last_reset(self.env) is not self._reset_seen:
+        if resets(self.env) != self._resets_seen:
             self._last_obs = None  # an evaluation, for example, has ended the open episodes
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
@@ -166,7 +166,7 @@ class PixelAgent(SavedAgent):
             self._last_obs = None  # open episodes may lack a step: the next call begins new ones
             raise
         finally:
-            self._reset_seen = last_reset(self.env)
+            self._resets_seen = resets(self.env)
             callback.on_training_end()
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
         outlook.warn(over=True, learns=continued or self.updates > made)

@@ -24,8 +24,9 @@ from wpt_agents.model.actions import space_as_dict, space_from_dict
 from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
-from wpt_agents.training.environments import as_vec_env, last_reset
+from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.randomness import Streams, torch_seed
+from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
 
@@ -50,7 +51,7 @@ class SavedAgent(KeywordAgent):
     action_space: spaces.Box
     _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
     _last_episode_starts: Any
-    _reset_seen: object = None  # of `last_reset`, when the environment was last in our hands
+    _resets_seen: int | None = None  # when the environment was last in our hands
 
     def __init__(
         self,
@@ -196,7 +197,7 @@ class SavedAgent(KeywordAgent):
         assert isinstance(env.action_space, spaces.Box)
         other = env.action_space.shape != self.action_space.shape
         self.env = env
-        self._reset_seen = last_reset(env)
+        self._resets_seen = resets(env)
         self.n_envs = env.num_envs
         self._vec_normalize_env = unwrap_vec_normalize(env)
         self.observation_space = env.observation_space
@@ -346,6 +347,6 @@ class SavedAgent(KeywordAgent):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""
-        left_out = {"env", "_vec_normalize_env", "_last_obs", "_reset_seen", "rollout"}
+        left_out = {"env", "_vec_normalize_env", "_last_obs", "_resets_seen", "rollout"}
         state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
         return state | {"_custom_logger": False}

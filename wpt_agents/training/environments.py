@@ -211,14 +211,6 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
     return env
 
 
-def last_reset(env: VecEnv) -> object:
-    """Return what is another object after each call of `reset`, whoever calls it.
-
-    Every VecEnv of SB3 makes new options then; one that does not is taken to be untouched.
-    """
-    return getattr(innermost(env), "_options", None)
-
-
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
     """Return the entry to see, or None if there is none; warn of what is left out."""
     boxes = {key: box for key, box in space.spaces.items() if isinstance(box, spaces.Box)}

@@ -41,6 +41,7 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
+from wpt_agents.training.evaluations import show_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.resets import resets
@@ -148,6 +149,7 @@ class PixelAgent(SavedAgent):
             self.progress.restart_steps()
         if resets(self.env) != self._resets_seen:
             self._last_obs = None  # an evaluation, for example, has ended the open episodes
+        eval_envs = show_same_entry(callback, self.env)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -168,6 +170,8 @@ class PixelAgent(SavedAgent):
         finally:
             self._resets_seen = resets(self.env)
             callback.on_training_end()
+            for evaluator, env in eval_envs.items():
+                evaluator.eval_env = env
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
         outlook.warn(over=True, learns=continued or self.updates > made)
 

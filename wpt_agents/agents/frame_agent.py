@@ -71,6 +71,8 @@ class FrameProgress(Progress):
     :ivar cloned: whether the prior actor has been trained
     """
 
+    of_weights: ClassVar[tuple[str, ...]] = ("cloned",)
+
     retrieved_ids: list[int] = field(default_factory=list)
     retrieved_of: str = ""
     cloned: bool = False

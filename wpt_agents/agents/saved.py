@@ -217,7 +217,8 @@ class SavedAgent(KeywordAgent):
     # Model files and copies
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", *(f"learner.{name}" for name in model_files.optimizers(self.learner))], []
+        optimizers = (f"learner.{name}" for name in model_files.optimizers(self.learner))
+        return ["policy", "progress", *optimizers], []
 
     def save(
         self,
@@ -329,7 +330,7 @@ class SavedAgent(KeywordAgent):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """Load weights and optimisers in place.
+        """Load weights and optimisers in place; counters, such as `num_timesteps`, stay.
 
         :param load_path_or_dict: a model file, or what `get_parameters` returns
         :param exact_match: refuse a dictionary that lacks parts of the agent or has others
@@ -339,11 +340,16 @@ class SavedAgent(KeywordAgent):
         if isinstance(load_path_or_dict, dict):
             self.fit_networks(load_path_or_dict.get("policy", {}))
             # A copy, as torch lets two optimisers share the averages that one hands to the other.
-            super().set_parameters(deepcopy(load_path_or_dict), exact_match, device)
+            # Dictionaries of earlier versions lack "progress".
+            parameters = {"progress": {}, **deepcopy(load_path_or_dict)}
+            super().set_parameters(parameters, exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         self._check_same(header, tensors, self.shape_keywords)
         self._load_tensors(tensors)
+        if model_files.WORLD_MODEL not in tensors:
+            progress = self.progress_class.of(header["counters"])
+            self.progress.load_state_dict(progress.state_dict())
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""

@@ -164,6 +164,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """
         super().set_parameters(*args, **kwargs)
         self.progress.initialised = True
+        self.choose_who_acts()
 
     def choose_who_acts(self) -> None:
         """Let the clone (`ibrl`, `residual`) and the average actor act where keywords say so.

@@ -866,6 +866,43 @@ def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path)
     assert {t.action_dim for t in model.retrieved.trajectories} == {2}
 
 
+class NewData(BaseCallback):
+    """Sets another dataset, and notes how many steps there are to rehearse afterwards."""
+
+    def __init__(self, dataset):
+        super().__init__()
+        self.dataset, self.seen = dataset, []
+
+    def _on_step(self):
+        if self.num_timesteps == 1:
+            self.model.set_dataset(self.dataset)
+        self.seen.append(len(self.model.retrieved))
+        return True
+
+
+def test_another_dataset_counts_from_the_next_call_of_learn_on(store):
+    model = pretrained(store, env=ClockEnv(7), num_retrieve=2)
+    callback = NewData([recorded(length=20, seed=9)])
+    clone = weights(model.learn(7, callback=callback), "prior_actor")
+    assert callback.seen == [16] * 7  # the former trajectories are rehearsed to the end
+    assert model.prior is not None and model.retrieved_of != model.dataset.fingerprint
+    model.bc_steps, model.num_retrieve = 3, 1
+    model.learn(7, reset_num_timesteps=False)
+    assert len(model.retrieved) == 20 and model.cloned
+    assert not same(clone, weights(model, "prior_actor"))
+    with pytest.raises(ValueError, match="the prior actor is cloned"):
+        model.bc_steps = 2
+
+
+def test_without_any_use_of_it_the_prior_actor_of_the_former_dataset_stays(store):
+    model = pretrained(store, env=ClockEnv(7)).learn(7)
+    clone = weights(model, "prior_actor")
+    model.guidance = 0
+    model.set_dataset([recorded(seed=9)])
+    model.learn(7)
+    assert model.prior is not None and same(clone, weights(model, "prior_actor"))
+
+
 def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_path):
     env = Monitor(ClockEnv(length=7))  # no spec: nothing says how long it lasts
     model = pretrained(store, env=env, guidance=1, warmup_steps=0)

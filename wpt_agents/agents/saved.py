@@ -133,7 +133,10 @@ class SavedAgent(KeywordAgent):
     # Data and environments
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another dataset from now on.
+        """Use another dataset from the next call of `learn` on.
+
+        Trajectories are then chosen, and the prior actor is trained, again. Until then the agent
+        goes on with those of the dataset before.
 
         :param dataset: any kind that the keyword `dataset` takes; None changes nothing
         :raises ValueError: something that is no dataset, or data that the agent cannot learn from

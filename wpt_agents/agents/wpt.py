@@ -180,10 +180,11 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=3)
         elif self.dataset is None and used and not progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=3)
-        if self.dataset is None or self.retrieved is not None or not used:
+        if self.dataset is None or not used or (self.retrieved is not None and not self.outdated):
             return
         kept = self.kept.trajectories if self.kept is not None else []
-        if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
+        outdated = self.outdated
+        if not progress.retrieved_ids or outdated:
             query = self.policy.embed(self.first_images(settings.retrieval_images))
             index = self.build_index(progress_bar)
             if kept:
@@ -193,6 +194,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 index, self.dataset, query, width, settings, self.streams, task_id(self.env)
             )
             progress.retrieved_of = self.dataset.fingerprint
+            self.retrieved = None  # those of before, also if the reading below is interrupted
+            if outdated and settings.needs_clone:
+                progress.cloned = False  # a clone is one of what is retrieved
         retrieved = ReplayBuffer()
         numbers = progress.retrieved_ids
         read = read_retrieved(self.dataset, kept, numbers, self.action_space)
@@ -304,15 +308,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     # The data and the task
 
-    def set_dataset(self, dataset: Data | None) -> None:
-        """Use another D_off from now on.
-
-        :param dataset: any kind that the keyword `dataset` takes; None changes nothing
-        :raises ValueError: a dataset with other images, wider actions or too short trajectories
-        """
-        super().set_dataset(dataset)
-        if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
-            self.retrieved = None
+    @property
+    def outdated(self) -> bool:
+        """Whether trajectories of another dataset than the present one are retrieved."""
+        progress = self.progress
+        other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
+        return bool(progress.retrieved_ids) and other
 
     @property
     def begun(self) -> bool:
@@ -356,8 +357,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""
-        if stage is Stage.RETRIEVAL and self.progress.retrieved_ids:
+        if stage is Stage.RETRIEVAL and self.progress.retrieved_ids and not self.outdated:
             return "the trajectories are retrieved; call reset_task() first"
-        if stage is Stage.CLONING and self.progress.cloned:
+        if stage is Stage.CLONING and self.progress.cloned and not self.outdated:
             return "the prior actor is cloned; call reset_task() first"
         return super().too_late(stage)

@@ -1,5 +1,6 @@
 """The base of all agents: keywords, random numbers, environment, model files and copies."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -25,6 +26,7 @@ from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
 from wpt_agents.training.environments import as_vec_env
+from wpt_agents.training.keywords import Stage
 from wpt_agents.training.randomness import Streams, torch_seed
 from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
@@ -285,6 +287,7 @@ class SavedAgent(KeywordAgent):
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
         agent.restore(header, tensors, cls.shape_keywords)
+        agent.warn_if_late(header, tensors)
         if env is not None:
             agent.set_env(env, force_reset)
         return agent
@@ -303,6 +306,19 @@ class SavedAgent(KeywordAgent):
         progress = self.progress_class.of(header["counters"])
         self._load_tensors(tensors)
         self.progress = progress
+
+    def warn_if_late(
+        self, header: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+    ) -> None:
+        """Warn of keywords that differ from those of a model file and have no effect on it."""
+        before = self.keywords.of(header["hyperparameters"])
+        late = {stage: self.too_late(stage) for stage in (Stage.RETRIEVAL, Stage.CLONING)}
+        if model_files.WORLD_MODEL not in tensors:
+            late[Stage.DRAWING] = "the weights are loaded; reset_task() draws others by it"
+        for name, declared in self.keywords.declared().items():
+            value = self.hyperparameters.value(name)
+            if value != before.value(name) and (why := late.get(declared.stage)):
+                warnings.warn(f"{name}={value!r} has no effect on this model: {why}", stacklevel=3)
 
     def _load_tensors(self, tensors: Mapping[str, Mapping[str, Tensor]]) -> None:
         self.fit_networks(tensors.get("policy", {}))

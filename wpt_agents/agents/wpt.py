@@ -124,7 +124,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             folder = Path(run_dir) if run_dir is not None else None
             if folder is not None and (folder / "model.zip").exists():
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
-                model.restore(*read_model(folder / "model.zip"), same)
+                saved = read_model(folder / "model.zip")
+                model.restore(*saved, same)
+                model.warn_if_late(*saved)
             steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
             steps = int(steps)  # of 2e4, too
             with model.operations():

@@ -13,6 +13,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # Read it as a sentence: the zoo runs agents, agents train models, models eat data, data are files.
 LAYERS = ["zoo", "agents", "training", "fast", "model", "data", "files"]
+# The folders of the zoo, from the top down; its single modules are below all of them.
+ROOMS = ["commands", "bench", "run", "report", "judge", "pictures", "plan", "collect"]
+ENTRANCES = {"wpt_agents.zoo.__main__", "wpt_agents.zoo.presets"}  # the second for version 0.1
 
 
 def modules(package):
@@ -58,6 +61,19 @@ def test_each_module_imports_only_from_its_own_folder_and_those_below(module):
     others = {folder(other) for other in within("wpt_agents")[module] - {"wpt_agents"}}
     above = {other for other in others if LAYERS.index(other) < LAYERS.index(room)}
     assert not {(room, other) for other in above}
+
+
+def zoo_room(module):
+    part = module.removeprefix("wpt_agents.zoo.").split(".")[0]
+    return part if part in ROOMS else None
+
+
+@pytest.mark.parametrize("module", [name for name in AGENT if name.startswith("wpt_agents.zoo.")])
+def test_each_folder_of_the_zoo_imports_only_from_those_below(module):
+    ours = zoo_room(module)
+    others = {zoo_room(other) for other in within("wpt_agents")[module]} - {ours, None}
+    below = ROOMS if module in ENTRANCES else ROOMS[ROOMS.index(ours) + 1 :] if ours else []
+    assert others <= set(below)
 
 
 @pytest.mark.parametrize("package", ["wpt_agents", "wpt_envs"])

@@ -108,6 +108,35 @@ def test_hyperparameters_themselves_cannot_be_written():
         agent().hyperparameters.gamma = 0.5
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("zero_init_heads", True, r"weights are loaded; reset_task\(\) draws others"),
+        ("actor_outscale", 0.01, r"weights are loaded; reset_task\(\) draws others"),
+        ("num_retrieve", 1, r"trajectories are retrieved; call reset_task\(\)"),
+        ("bc_steps", 1, r"prior actor is cloned; call reset_task\(\)"),
+    ],
+)
+def test_a_keyword_that_comes_too_late_for_a_model_file_is_warned_of(
+    data, name, value, why, tmp_path
+):
+    model = pretrained(data, env=DotEnv(), zero_init_heads=False).learn(1)
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match=f"{name}={value} has no effect .*: .*{why}") as caught:
+        WPT.load(tmp_path / "model", **{name: value})
+    assert caught[0].filename == __file__
+    WPT.load(tmp_path / "model", **{name: getattr(model, name)})  # says nothing
+    WPT.load(tmp_path / "model", dataset=[recorded(seed=9)], num_retrieve=1, bc_steps=1)
+
+
+def test_a_keyword_of_new_heads_takes_effect_where_a_file_has_none(tmp_path):
+    model = agent(zero_init_heads=False)
+    model.save_world_model(tmp_path / "shared.zip")
+    loaded = WPT.load(tmp_path / "shared.zip", zero_init_heads=True)
+    assert not loaded.policy.critic.layers[-1].weight.any()
+    assert model.policy.critic.layers[-1].weight.any()
+
+
 def test_fine_tuning_keywords_are_those_that_pre_training_does_not_use():
     assert {"gamma", "guidance", "bc_steps", "num_retrieve", "actor_delay", "fast"} <= FINE_TUNING
     assert not {"size", "batch_size", "learning_rate", "unimix", "seed"} & FINE_TUNING

@@ -106,6 +106,17 @@ def test_a_loaded_model_goes_on_exactly_without_cloning_again(dataset, tmp_path,
     assert same(weights(whole), weights(loaded))
 
 
+def test_trajectories_of_another_dataset_are_cloned_again(dataset):
+    model = agent(dataset).learn(60)
+    clone = weights(model, "prior_actor")
+    model.set_dataset([recorded(12, 7, embodiment="dot")])
+    assert model.prior is not None
+    model.bc_steps = 2
+    model.learn(60, reset_num_timesteps=False)
+    assert model.progress.retrieved_ids == [0] and model.progress.cloned
+    assert not same(clone, weights(model, "prior_actor"))
+
+
 def test_without_a_dataset_it_warns_and_learns_as_drqv2():
     with pytest.warns(UserWarning, match="without offline data"):
         model = agent(None).learn(60)

@@ -141,6 +141,12 @@ def test_data_whose_reading_was_interrupted_are_read_again_and_whole(dataset, mo
         with pytest.raises(KeyboardInterrupt):
             model.learn(7)
     assert len(model.learn(7).retrieved.trajectories) == 4
+    model.set_dataset(dataset("other", n=2))
+    with monkeypatch.context() as patch:
+        patch.setattr("wpt_agents.agents.frame_agent.in_units_of", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(7)
+    assert len(model.learn(7).retrieved.trajectories) == 2
 
 
 def test_the_number_of_trajectories_is_fixed_once_they_are_chosen(dataset, tmp_path):

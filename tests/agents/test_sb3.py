@@ -32,6 +32,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from toy_env import LENGTH, DotEnv
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.model.prior_policy import PriorPolicy
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.rollout import Rollout
 
@@ -592,6 +593,20 @@ def test_the_zoo_of_sb3_makes_and_loads_it_by_its_own_keywords(tmp_path):
     keywords = {"seed": 3, "tensorboard_log": str(tmp_path), "verbose": 0, "gamma": 0.9}
     loaded = WPT.load(tmp_path / "model.zip", env=ClockEnv(), custom_objects={}, **keywords)
     assert (loaded.seed, loaded.gamma, loaded.tensorboard_log) == (3, 0.9, str(tmp_path))
+
+
+@pytest.mark.parametrize("side", [64, 32])
+@pytest.mark.parametrize("ibrl", [False, True])
+def test_of_no_observations_there_are_no_actions(side, ibrl):
+    model = agent(ClockEnv())
+    model.policy.ibrl = ibrl
+    none = np.zeros((0, side, side, 3), np.uint8)
+    action, state = model.predict(none)
+    assert action.shape == (0, 2)
+    assert model.predict(none, state, np.zeros(0, bool))[0].shape == (0, 2)
+    with pytest.raises(ValueError, match="of 2 environments, the observation of 0"):
+        model.predict(none, model.policy.initial_state(2))
+    assert PriorPolicy(model.policy).predict(none)[0].shape == (0, 2)
 
 
 def test_the_policy_alone_answers_as_sb3s_do():

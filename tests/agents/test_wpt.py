@@ -18,6 +18,7 @@ from debug_agent import (
     same,
     weights,
 )
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -276,15 +277,18 @@ def test_one_first_image_resets_nothing_and_in_an_episode_there_is_only_one(stor
     assert (model.replay_buffer.trajectories[0].image[0] == first_images(1, 2)[0]).all()
 
 
-def test_random_retrieval_looks_at_nothing_but_width_and_seed(store):
-    def retrieved(start, seed):
+def test_random_retrieval_looks_at_nothing_but_width_seed_and_task(store):
+    def retrieved(start, seed, task=None):
         model = pretrained(store, num_retrieve=2, retrieval="random", seed=seed)
-        model.set_env(DotEnv())
+        env = DotEnv()
+        env.spec = task and EnvSpec(task, entry_point=DotEnv)
+        model.set_env(env)
         model.env.seed(start)
         return tuple(model.learn(1).retrieved_ids)
 
     assert retrieved(1, seed=0) == retrieved(2, seed=0)
     assert len({retrieved(1, seed) for seed in range(6)}) > 1
+    assert len({retrieved(1, 0, f"Dot{number}-v0") for number in range(6)}) > 1
     assert all(i < 4 for seed in range(6) for i in retrieved(1, seed))
 
 
@@ -862,6 +866,43 @@ def test_trajectories_of_one_dataset_are_not_taken_from_another(store, tmp_path)
     model.set_dataset(other)
     assert sorted(model.learn(LENGTH).retrieved_ids) == [4, 5, 6]
     assert {t.action_dim for t in model.retrieved.trajectories} == {2}
+
+
+class NewData(BaseCallback):
+    """Sets another dataset, and notes how many steps there are to rehearse afterwards."""
+
+    def __init__(self, dataset):
+        super().__init__()
+        self.dataset, self.seen = dataset, []
+
+    def _on_step(self):
+        if self.num_timesteps == 1:
+            self.model.set_dataset(self.dataset)
+        self.seen.append(len(self.model.retrieved))
+        return True
+
+
+def test_another_dataset_counts_from_the_next_call_of_learn_on(store):
+    model = pretrained(store, env=ClockEnv(7), num_retrieve=2)
+    callback = NewData([recorded(length=20, seed=9)])
+    clone = weights(model.learn(7, callback=callback), "prior_actor")
+    assert callback.seen == [16] * 7  # the former trajectories are rehearsed to the end
+    assert model.prior is not None and model.retrieved_of != model.dataset.fingerprint
+    model.bc_steps, model.num_retrieve = 3, 1
+    model.learn(7, reset_num_timesteps=False)
+    assert len(model.retrieved) == 20 and model.cloned
+    assert not same(clone, weights(model, "prior_actor"))
+    with pytest.raises(ValueError, match="the prior actor is cloned"):
+        model.bc_steps = 2
+
+
+def test_without_any_use_of_it_the_prior_actor_of_the_former_dataset_stays(store):
+    model = pretrained(store, env=ClockEnv(7)).learn(7)
+    clone = weights(model, "prior_actor")
+    model.guidance = 0
+    model.set_dataset([recorded(seed=9)])
+    model.learn(7)
+    assert model.prior is not None and same(clone, weights(model, "prior_actor"))
 
 
 def test_an_unknown_episode_length_is_found_out_and_kept_by_the_file(store, tmp_path):

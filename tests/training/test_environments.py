@@ -11,10 +11,11 @@ from debug_agent import ClockEnv, agent, noise, on_time
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.training.environments import as_vec_env
@@ -261,6 +262,24 @@ def test_prediction_and_evaluation_take_the_dictionary_too():
     assert np.array_equal(one, same)
     mean, _ = evaluate_policy(model, Monitor(Cameras("top")), 1)
     assert mean == 28
+
+
+def normalised(**keywords):
+    cameras = DummyVecEnv([lambda: Monitor(Cameras("top"))] * 2)
+    return VecNormalize(cameras, norm_obs=False, **keywords)
+
+
+@pytest.mark.filterwarnings("ignore:Of the Dict")
+@pytest.mark.parametrize(
+    "wrap", [lambda it: it, lambda it: [it], lambda it: EveryNTimesteps(8, it)]
+)
+def test_an_evaluation_sees_the_same_entry_and_takes_over_normalised_rewards(wrap):
+    eval_env = normalised(training=False)
+    evaluation = EvalCallback(eval_env, eval_freq=1, n_eval_episodes=1, verbose=0)
+    model = agent(normalised()).learn(28, callback=wrap(evaluation))
+    assert evaluation.last_mean_reward == 28
+    assert eval_env.ret_rms.count == pytest.approx(model.get_vec_normalize_env().ret_rms.count, 8)
+    assert eval_env.ret_rms.count > 2 and evaluation.eval_env is eval_env
 
 
 @pytest.mark.filterwarnings("ignore:Evaluation environment")

@@ -1,13 +1,17 @@
 """VecEnvs unlike those of Stable-Baselines3, reused image buffers, devices that do not work."""
 
+from copy import deepcopy
+
 import pytest
 from clock_episodes import all_on_time, learnt, stored
 from debug_agent import ClockEnv, agent, noise
 from gymnasium.vector import SyncVectorEnv
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.training.resets import resets
 
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
@@ -72,6 +76,32 @@ def test_a_vecenv_without_the_last_image_is_refused_by_name_and_nothing_is_store
 )
 def test_an_environment_that_draws_into_one_array_keeps_its_last_images(wrap):
     assert all_on_time(learnt(wrap()), 6)
+
+
+class Quiet(DummyVecEnv):
+    """Leaves the private attributes alone that VecEnvs of Stable-Baselines3 renew in a reset."""
+
+    def _reset_options(self):
+        pass
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor])
+def test_after_an_evaluation_on_a_foreign_vecenv_new_episodes_begin(wrap):
+    env = wrap(Quiet([ClockEnv]))
+    model = agent(env).learn(3)  # in the middle of an episode
+    model.learn(1, reset_num_timesteps=False)
+    assert model.rollout.longest_open() == 4  # which went on
+    evaluate_policy(model, env, 1, warn=False)
+    model.learn(14, reset_num_timesteps=False)
+    assert all_on_time(model, 2)
+
+
+def test_a_copy_of_a_vecenv_is_counted_by_itself():
+    env = DummyVecEnv([ClockEnv])
+    assert resets(env) == 0
+    copy = deepcopy(env)
+    copy.reset()
+    assert (resets(env), resets(copy), copy.envs[0] is env.envs[0]) == (0, 1, False)
 
 
 @FORK

@@ -10,10 +10,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from wpt_envs import TASKS
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.zoo.judge.evaluation import EpisodeSeeds
 from wpt_agents.zoo.run.checkpoints import HEAD_START_MODEL, HeadStart
 from wpt_agents.zoo.run.logs import Evaluations
 from wpt_agents.zoo.tasks import metric_of
+from wpt_agents.zoo.vec_envs import EpisodeSeeds
 
 # returns and successes of two episodes in each of five evaluations, after 7, 14, ... steps
 RETURNS = [[5, 5], [9, 9], [4, 6], [8, 8], [8, 8]]

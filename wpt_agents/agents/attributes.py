@@ -105,7 +105,7 @@ class KeywordAgent(BaseAlgorithm):
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""
-        if stage is Stage.SIZE:
+        if stage in (Stage.SIZE, Stage.DRAWING):
             return f"the networks are made; make a new {type(self).__name__} with it"
         return None
 

@@ -41,9 +41,10 @@ from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
 from wpt_agents.training.checks import check_rewards
-from wpt_agents.training.environments import last_reset
+from wpt_agents.training.evaluations import show_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
+from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout, Window, last_images, step_all
 
 Metrics = dict[str, list[Tensor]]
@@ -146,12 +147,13 @@ class PixelAgent(SavedAgent):
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
         if reset_num_timesteps:
             self.progress.restart_steps()
-        if last_reset(self.env) is not self._reset_seen:
+        if resets(self.env) != self._resets_seen:
             self._last_obs = None  # an evaluation, for example, has ended the open episodes
+        eval_envs = show_same_entry(callback, self.env)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._reset_seen = last_reset(self.env)
+        self._resets_seen = resets(self.env)
         if self.verbose:
             print(self)
         updates_before = self.updates
@@ -168,6 +170,8 @@ class PixelAgent(SavedAgent):
             raise
         finally:
             callback.on_training_end()
+            for evaluator, env in eval_envs.items():
+                evaluator.eval_env = env
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
         outlook.warn(over=True, learns=continued or self.updates > updates_before)
 
@@ -201,14 +205,14 @@ class PixelAgent(SavedAgent):
             finished = rollout.end_step(rewards, dones, last)
             self._store(finished, int(full.sum()))  # before the callback, which may save the replay
             callback.update_locals(locals())
-            self._reset_seen = last_reset(self.env)  # a step may reset all, with some VecEnvs
+            self._resets_seen = resets(self.env)  # a step may reset all, with some VecEnvs
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             self._log_episodes(log_interval, len(finished))
             self._last_obs = new_obs
             self._last_episode_starts = dones
             # A callback may have played other episodes on the environment.
-            ended = bool(finished) or last_reset(self.env) is not self._reset_seen
+            ended = bool(finished) or resets(self.env) != self._resets_seen
         if go_on:
             callback.on_rollout_end()
         return go_on
@@ -235,12 +239,12 @@ class PixelAgent(SavedAgent):
         assert self.env is not None
         self._last_obs = self.env.reset()
         self._last_episode_starts = np.ones(self.n_envs, bool)
-        self._reset_seen = last_reset(self.env)
+        self._resets_seen = resets(self.env)
 
     def _open_rollout(self) -> Rollout:
         """Return the open episodes; new ones if all environments were just reset."""
         assert self.env is not None
-        if last_reset(self.env) is not self._reset_seen:
+        if resets(self.env) != self._resets_seen:
             self.begin_episodes()
         if self.rollout is None or self._last_episode_starts.all():
             self.rollout = Rollout(

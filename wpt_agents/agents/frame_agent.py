@@ -18,6 +18,7 @@ from wpt_agents.data.transitions import Transitions, draw_transitions
 from wpt_agents.data.units import compare_units, in_units_of
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.training.checks import check_images
+from wpt_agents.training.environments import task_id
 from wpt_agents.training.keywords import (
     Keywords,
     Stage,
@@ -70,6 +71,8 @@ class FrameProgress(Progress):
     :ivar retrieved_of: the fingerprint of the dataset that they number
     :ivar cloned: whether the prior actor has been trained
     """
+
+    of_weights: ClassVar[tuple[str, ...]] = ("cloned",)
 
     retrieved_ids: list[int] = field(default_factory=list)
     retrieved_of: str = ""
@@ -142,7 +145,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
             compare_units(self.dataset, self.action_space, self.hyperparameters.embodiment)
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another dataset; the next call of `learn` chooses the offline data from it."""
+        """Use another dataset; the next call of `learn` chooses the offline data from it.
+
+        Until then the agent goes on with those of the dataset before.
+        """
         if dataset is not None and not self.uses_data:
             warnings.warn(
                 f"{type(self).__name__} learns from its environment alone, so dataset= has no "
@@ -150,12 +156,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
                 stacklevel=3,
             )
         super().set_dataset(dataset)
-        if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
-            self.retrieved = None
 
     def prepare(self, progress_bar: bool) -> None:
         """Choose and read the offline data, if any are used."""
-        if not self.wants_data or self.retrieved is not None:
+        if not self.wants_data or (self.retrieved is not None and not self.outdated):
             return
         if self.dataset is None:
             warnings.warn(
@@ -165,6 +169,8 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         if self.progress.retrieved_of != self.dataset.fingerprint:
             self.progress.retrieved_ids = self._related()
             self.progress.retrieved_of = self.dataset.fingerprint
+            self.progress.cloned = False
+            self.retrieved = None  # those of before, also if the reading below is interrupted
         retrieved = ReplayBuffer()
         chosen = self.dataset.subset(self.progress.retrieved_ids)
         read = in_units_of(chosen, self.action_space)
@@ -181,20 +187,23 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         self.retrieved = retrieved  # all of them, or none if reading was interrupted
 
     @property
-    def chosen(self) -> bool:
-        """Whether offline data of the present dataset are chosen, read or not."""
+    def outdated(self) -> bool:
+        """Whether offline data of another dataset than the present one are chosen."""
         progress = self.progress
         other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
-        return bool(progress.retrieved_ids) and not other
+        return bool(progress.retrieved_ids) and other
+
+    @property
+    def chosen(self) -> bool:
+        """Whether offline data of the present dataset are chosen, read or not."""
+        return bool(self.progress.retrieved_ids) and not self.outdated
 
     def _related(self) -> list[int]:
-        assert self.dataset is not None and self.env is not None
-        settings, task = self.hyperparameters, self.hyperparameters.task
-        if task is None and self.env.has_attr("spec"):
-            task = getattr(self.env.get_attr("spec")[0], "id", None)
+        assert self.dataset is not None
+        settings = self.hyperparameters
         return related_trajectories(
             self.dataset,
-            task,
+            settings.task if settings.task is not None else task_id(self.env),
             settings.embodiment,
             self.policy.action_dim,
             settings.value("num_retrieve"),

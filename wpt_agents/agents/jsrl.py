@@ -83,8 +83,8 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
 
     @property
     def wants_data(self) -> bool:
-        """Whether offline data are used: until they are cloned."""
-        return not self.progress.cloned
+        """Whether offline data are used: until they are cloned, and again if they are others."""
+        return not self.progress.cloned or self.outdated
 
     def prepare(self, progress_bar: bool) -> None:
         """Train the clone on the offline data, once for a task."""
@@ -109,7 +109,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""
-        if stage in (Stage.RETRIEVAL, Stage.CLONING) and self.progress.cloned:
+        if stage in (Stage.RETRIEVAL, Stage.CLONING) and not self.wants_data:
             return "the clone is trained; call reset_task() first"
         return super().too_late(stage)
 

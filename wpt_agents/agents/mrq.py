@@ -75,6 +75,9 @@ class MRQProgress(FrameProgress):
     :ivar updates_before: updates that were made for earlier tasks
     """
 
+    # The values are in units of these.
+    of_weights: ClassVar[tuple[str, ...]] = ("scale", "target_scale")
+
     scale: float = 1.0
     target_scale: float = 0.0
     updates_before: int = field(default=0, metadata={"earlier": 0})

@@ -139,7 +139,7 @@ class R3MKeywords(DrQv2Keywords):
         must("the path of a file", lambda value: isinstance(value, str)),
         "file of R3M's authors, such as r3m_18.pt, that the encoder is read from when the agent is "
         "made; `pretrain` then makes no updates. `backbone` must fit the file. A model file holds "
-        "the network itself and does not need it",
+        "the network itself, so that this has no effect in `load`",
         Stage.SIZE,
     )
 

@@ -1,5 +1,6 @@
 """The base of all agents: keywords, random numbers, environment, model files and copies."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -24,8 +25,10 @@ from wpt_agents.model.actions import space_as_dict, space_from_dict
 from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
-from wpt_agents.training.environments import as_vec_env, last_reset
+from wpt_agents.training.environments import as_vec_env
+from wpt_agents.training.keywords import Stage
 from wpt_agents.training.randomness import Streams, torch_seed
+from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
 
@@ -50,7 +53,7 @@ class SavedAgent(KeywordAgent):
     action_space: spaces.Box
     _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
     _last_episode_starts: Any
-    _reset_seen: object = None  # of `last_reset`, when the environment was last in our hands
+    _resets_seen: int | None = None  # when the environment was last in our hands
 
     def __init__(
         self,
@@ -132,7 +135,10 @@ class SavedAgent(KeywordAgent):
     # Data and environments
 
     def set_dataset(self, dataset: Data | None) -> None:
-        """Use another dataset from now on.
+        """Use another dataset from the next call of `learn` on.
+
+        Trajectories are then chosen, and the prior actor is trained, again. Until then the agent
+        goes on with those of the dataset before.
 
         :param dataset: any kind that the keyword `dataset` takes; None changes nothing
         :raises ValueError: something that is no dataset, or data that the agent cannot learn from
@@ -211,12 +217,13 @@ class SavedAgent(KeywordAgent):
         self.check_units()
         if self.hyperparameters.seed is not None:
             env.seed(self.hyperparameters.seed)
-        self._reset_seen = last_reset(env)
+        self._resets_seen = resets(env)
 
     # Model files and copies
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", *(f"learner.{name}" for name in model_files.optimizers(self.learner))], []
+        optimizers = (f"learner.{name}" for name in model_files.optimizers(self.learner))
+        return ["policy", "progress", *optimizers], []
 
     def save(
         self,
@@ -280,6 +287,7 @@ class SavedAgent(KeywordAgent):
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
         agent.restore(header, tensors, cls.shape_keywords)
+        agent.warn_if_late(header, tensors)
         if env is not None:
             agent.set_env(env, force_reset)
         return agent
@@ -298,6 +306,19 @@ class SavedAgent(KeywordAgent):
         progress = self.progress_class.of(header["counters"])
         self._load_tensors(tensors)
         self.progress = progress
+
+    def warn_if_late(
+        self, header: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
+    ) -> None:
+        """Warn of keywords that differ from those of a model file and have no effect on it."""
+        before = self.keywords.of(header["hyperparameters"])
+        late = {stage: self.too_late(stage) for stage in (Stage.RETRIEVAL, Stage.CLONING)}
+        if model_files.WORLD_MODEL not in tensors:
+            late[Stage.DRAWING] = "the weights are loaded; reset_task() draws others by it"
+        for name, declared in self.keywords.declared().items():
+            value = self.hyperparameters.value(name)
+            if value != before.value(name) and (why := late.get(declared.stage)):
+                warnings.warn(f"{name}={value!r} has no effect on this model: {why}", stacklevel=3)
 
     def _load_tensors(self, tensors: Mapping[str, Mapping[str, Tensor]]) -> None:
         self.fit_networks(tensors.get("policy", {}))
@@ -328,7 +349,7 @@ class SavedAgent(KeywordAgent):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """Load weights and optimisers in place.
+        """Load weights and optimisers in place; counters, such as `num_timesteps`, stay.
 
         :param load_path_or_dict: a model file, or what `get_parameters` returns
         :param exact_match: refuse a dictionary that lacks parts of the agent or has others
@@ -338,14 +359,19 @@ class SavedAgent(KeywordAgent):
         if isinstance(load_path_or_dict, dict):
             self.fit_networks(load_path_or_dict.get("policy", {}))
             # A copy, as torch lets two optimisers share the averages that one hands to the other.
-            super().set_parameters(deepcopy(load_path_or_dict), exact_match, device)
+            # Dictionaries of earlier versions lack "progress".
+            parameters = {"progress": {}, **deepcopy(load_path_or_dict)}
+            super().set_parameters(parameters, exact_match, device)
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         self._check_same(header, tensors, self.shape_keywords)
         self._load_tensors(tensors)
+        if model_files.WORLD_MODEL not in tensors:
+            progress = self.progress_class.of(header["counters"])
+            self.progress.load_state_dict(progress.state_dict())
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""
-        left_out = {"env", "_vec_normalize_env", "_last_obs", "_reset_seen", "rollout"}
+        left_out = {"env", "_vec_normalize_env", "_last_obs", "_resets_seen", "rollout"}
         state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
         return state | {"_custom_logger": False}

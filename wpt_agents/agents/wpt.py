@@ -32,6 +32,7 @@ from wpt_agents.model.sizes import Size, find_size
 from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.distributed import joined, local_device
+from wpt_agents.training.environments import task_id
 from wpt_agents.training.guidance import draw_window
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
@@ -124,7 +125,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             folder = Path(run_dir) if run_dir is not None else None
             if folder is not None and (folder / "model.zip").exists():
                 same = (*cls.shape_keywords, "batch_size", "batch_length")
-                model.restore(*read_model(folder / "model.zip"), same)
+                saved = read_model(folder / "model.zip")
+                model.restore(*saved, same)
+                model.warn_if_late(*saved)
             steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
             steps = int(steps)  # of 2e4, too
             with model.operations():
@@ -179,19 +182,23 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         if self.dataset is None:
             self._warn_without_dataset()
             return
-        if self.retrieved is not None:
+        if self.retrieved is not None and not self.outdated:
             return
         kept = self.kept.trajectories if self.kept is not None else []
-        if not progress.retrieved_ids or progress.retrieved_of != self.dataset.fingerprint:
+        outdated = self.outdated
+        if not progress.retrieved_ids or outdated:
             query = self.policy.embed(self.first_images(settings.retrieval_images))
             index = self.build_index(progress_bar)
             if kept:
                 index = with_kept(index, kept, self.policy.embed)
             width = self.action_space.shape[0]
             progress.retrieved_ids = retrieve_ids(
-                index, self.dataset, query, width, settings, self.streams
+                index, self.dataset, query, width, settings, self.streams, task_id(self.env)
             )
             progress.retrieved_of = self.dataset.fingerprint
+            self.retrieved = None  # those of before, also if the reading below is interrupted
+            if outdated and settings.needs_clone:
+                progress.cloned = False  # a clone is one of what is retrieved
         retrieved = ReplayBuffer()
         ids = progress.retrieved_ids
         trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
@@ -324,15 +331,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     # The data and the task
 
-    def set_dataset(self, dataset: Data | None) -> None:
-        """Use another D_off from now on.
-
-        :param dataset: any kind that the keyword `dataset` takes; None changes nothing
-        :raises ValueError: a dataset with other images, wider actions or too short trajectories
-        """
-        super().set_dataset(dataset)
-        if self.dataset is not None and self.progress.retrieved_of != self.dataset.fingerprint:
-            self.retrieved = None
+    @property
+    def outdated(self) -> bool:
+        """Whether trajectories of another dataset than the present one are retrieved."""
+        progress = self.progress
+        other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
+        return bool(progress.retrieved_ids) and other
 
     @property
     def begun(self) -> bool:
@@ -376,8 +380,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def too_late(self, stage: Stage) -> str | None:
         """Return the remedy if keywords of this stage can no longer take effect, else None."""
-        if stage is Stage.RETRIEVAL and self.progress.retrieved_ids:
+        if stage is Stage.RETRIEVAL and self.progress.retrieved_ids and not self.outdated:
             return "the trajectories are retrieved; call reset_task() first"
-        if stage is Stage.CLONING and self.progress.cloned:
+        if stage is Stage.CLONING and self.progress.cloned and not self.outdated:
             return "the prior actor is cloned; call reset_task() first"
         return super().too_late(stage)

@@ -21,7 +21,7 @@ def resized(images: np.ndarray, size: int) -> np.ndarray:
     """
     _, height, width, channels = images.shape
     rows, columns = area_weights(height, size), area_weights(width, size)
-    parts = []
+    parts = [np.zeros((0, size, size, channels), np.uint8)]  # the answer to no images
     chunk = max(1, CHUNK * 256**2 // max(height * width, 256**2))  # fewer images if they are large
     for at in range(0, len(images), chunk):
         pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + chunk])).float()

@@ -189,6 +189,8 @@ class WPTPolicy(PixelPolicy):
             check_state(state, tuple(part.shape[1:] for part in fresh), n)
         deter, stoch, *_, before = (self._tensor(x) for x in state or fresh)
         first = check_episode_start(episode_start, n)
+        if n == 0:  # no actions for no observations, as SB3's own policies return
+            return fresh[-1], fresh
         inputs = self._tensor(image), Latent(deter, stoch), before, self._tensor(first)
         # The authors draw the latent even if the action is deterministic.
         post, outputs = acting_step(self, *inputs, generator, not deterministic)

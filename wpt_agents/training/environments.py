@@ -214,14 +214,6 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
     return env
 
 
-def last_reset(env: VecEnv) -> object:
-    """Return what is another object after each call of `reset`, whoever calls it.
-
-    Every VecEnv of SB3 forgets its seeds then; one that does not is taken to be untouched.
-    """
-    return getattr(innermost(env), "_seeds", None)
-
-
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
     """Return the entry to see, or None if there is none; warn of what is left out."""
     boxes = {key: box for key, box in space.spaces.items() if isinstance(box, spaces.Box)}
@@ -252,9 +244,17 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
 
 def time_limit(env: VecEnv | None) -> int | None:
     """Return the steps after which the environment ends an episode, if it says so."""
+    return getattr(_spec(env), "max_episode_steps", None)
+
+
+def task_id(env: VecEnv | None) -> str | None:
+    """Return the id that the environment is registered by, None if it has none."""
+    return getattr(_spec(env), "id", None)
+
+
+def _spec(env: VecEnv | None) -> Any:
     assert env is not None
-    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
-    return getattr(spec, "max_episode_steps", None)
+    return env.get_attr("spec")[0] if env.has_attr("spec") else None
 
 
 def last_observation(

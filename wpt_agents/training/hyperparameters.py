@@ -71,10 +71,16 @@ class Hyperparameters(Keywords):
         positive=True,
     )
     zero_init_heads: bool | None = switch(
-        None, "start reward head and critic at zero; None: the size decides", Stage.SIZE
+        None,
+        "start reward head and critic at zero; None: the size decides. Heads that are loaded stay "
+        "as they are until `reset_task`",
+        Stage.DRAWING,
     )
     actor_outscale: float = amount(
-        1.0, "factor on the initial weights of the actor's last layer", Stage.SIZE
+        1.0,
+        "factor on the initial weights of the actor's last layer. An actor that is loaded stays as "
+        "it is until `reset_task`",
+        Stage.DRAWING,
     )
     bin_range: float = keyword(
         BIN_RANGE,
@@ -398,4 +404,6 @@ class Hyperparameters(Keywords):
         return parse_schedule(self.value(name), np.inf, name)
 
 
-FINE_TUNING = Hyperparameters.of_stages(*(set(Stage) - {Stage.SIZE, Stage.PRETRAINING}))
+FINE_TUNING = Hyperparameters.of_stages(
+    *(set(Stage) - {Stage.SIZE, Stage.DRAWING, Stage.PRETRAINING})
+)

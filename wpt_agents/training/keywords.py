@@ -35,6 +35,7 @@ class Stage(Enum):
     """When a keyword is used, and thereby until when it can be changed."""
 
     SIZE = "size"  # when the networks are made; fixed from then on
+    DRAWING = "drawing"  # when weights of heads are drawn: for new networks, and for another task
     PRETRAINING = "pre-training"  # in every update of the world model, also during a task
     RETRIEVAL = "retrieval"  # once for a task, before anything is collected
     CLONING = "cloning"  # once for a task, after retrieval

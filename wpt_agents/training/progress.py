@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 RENAMED = {"_windows_drawn": "windows_drawn", "_seen_length": "seen_length"}  # since version 0.1
 
@@ -14,6 +14,7 @@ class Progress:
     A field that is added later needs `field(metadata={"earlier": value})`, the value for model
     files that were written without it.
 
+    :cvar of_weights: counters that belong to the weights, wherever these are loaded
     :ivar num_timesteps: calls of `env.step`, counted once for every environment
     :ivar episodes: episodes that were collected
     :ivar updates: updates that were made for a task
@@ -23,6 +24,8 @@ class Progress:
     :ivar cut: trajectories that were stored before their episode ended
     :ivar earlier_steps: steps before `num_timesteps` began at 0 again
     """
+
+    of_weights: ClassVar[tuple[str, ...]] = ()
 
     num_timesteps: int = 0
     episodes: int = 0
@@ -54,6 +57,15 @@ class Progress:
         """Return the counters by name, as model files hold them."""
         return asdict(self)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what belongs to the weights, as `get_parameters` of Stable-Baselines3 asks."""
+        return {name: getattr(self, name) for name in self.of_weights}
+
+    def load_state_dict(self, state: Mapping[str, Any], strict: bool = True) -> None:
+        """Take over what `state_dict` returns; what is missing stays."""
+        for name in state.keys() & set(self.of_weights):
+            setattr(self, name, state[name])
+
     def restart_steps(self) -> None:
         """Count the steps from 0 again; random numbers go on and do not repeat."""
         self.earlier_steps += self.num_timesteps
@@ -75,6 +87,8 @@ class WorldModelProgress(Progress):
     :ivar initialised: whether a new world model was adapted to its data
     :ivar cloned: whether the prior actor is trained
     """
+
+    of_weights: ClassVar[tuple[str, ...]] = ("cloned",)
 
     pretrain_steps: int = 0
     task_updates: int = field(default=0, metadata={"earlier": 0})

@@ -12,9 +12,9 @@ from zoo_command import call
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.zoo.judge.evaluation import make_vec_env
 from wpt_agents.zoo.judge.retrieved import own_task_shares
 from wpt_agents.zoo.pictures import datasets, retrieval
+from wpt_agents.zoo.vec_envs import make_vec_env
 
 
 @pytest.fixture

@@ -9,10 +9,10 @@ from dot_runs import dot  # noqa: F401  (dot registers the task for each test)
 from rich.console import Console
 from run_folders import make_run
 
+from wpt_agents.zoo.numbers import interval_text
 from wpt_agents.zoo.report import tables
-from wpt_agents.zoo.report.folders import read_results
-from wpt_agents.zoo.report.numbers import interval_text
 from wpt_agents.zoo.result import Result, Score, Variant, write_result
+from wpt_agents.zoo.results import read_results
 
 
 def fake_result(seed, mean, method="wpt", frames=150_000, untrained=()):

@@ -14,11 +14,12 @@ from dot_runs import dot, job  # noqa: F401  (dot registers the task for each te
 from engine_work import die_always, die_once, do_dot, fail, slow_once, touch
 from zoo_command import call
 
+from wpt_agents.zoo.locks import locked
+from wpt_agents.zoo.plan.overview import identity_of
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run import engines
 from wpt_agents.zoo.run.engines import Local, Ray, Resources, Slurm, run_on
-from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.watch import standing
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
@@ -144,7 +145,7 @@ def test_an_engine_records_finished_runs_and_reports_one_that_it_could_not_recor
     finish(first)
     monkeypatch.setattr(Local, "map", lambda *_: {})
     assert run_on("local", [first], False, Resources())
-    assert {line.run for line in record.read(path)} == {record.identity_of(first)}
+    assert {line.run for line in record.read(path)} == {identity_of(first)}
 
     def fail_to_record(_, work, jobs, tick):
         for one in jobs:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 
-from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.results import read_results
 from wpt_agents.zoo.run import runner
 
 pytestmark = pytest.mark.slow  # whole runs

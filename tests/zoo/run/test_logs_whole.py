@@ -9,9 +9,9 @@ from faults import kill_at_change, killed
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from wpt_agents.zoo.judge.evaluation import EpisodeSeeds
 from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
 from wpt_agents.zoo.run.logs import Evaluations
+from wpt_agents.zoo.vec_envs import EpisodeSeeds
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 

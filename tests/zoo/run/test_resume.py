@@ -20,15 +20,16 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_model
 from wpt_agents.training.learner import Learner
-from wpt_agents.zoo.judge.evaluation import EpisodeSeeds, make_vec_env
+from wpt_agents.zoo import locks
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.run import learning, locks, runner
+from wpt_agents.zoo.run import learning, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
 from wpt_agents.zoo.run.evaluating import file_hash
-from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.shared import collect_data, pretrain
+from wpt_agents.zoo.vec_envs import EpisodeSeeds, make_vec_env
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 

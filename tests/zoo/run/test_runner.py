@@ -22,9 +22,11 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.learner import Learner
 from wpt_agents.zoo.judge import evaluation
-from wpt_agents.zoo.judge.evaluation import evaluate, make_vec_env
+from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import DoNothing, RandomPolicy
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.methods import METHODS
+from wpt_agents.zoo.plan.overview import identity_of
 from wpt_agents.zoo.plan.presets import load_preset
 from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.plan.shared import Shared
@@ -33,9 +35,9 @@ from wpt_agents.zoo.report import record
 from wpt_agents.zoo.report.folders import find_finished
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
 from wpt_agents.zoo.run import evaluating, learning, runner, shared
-from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.shared import collect_data, pretrain
+from wpt_agents.zoo.vec_envs import make_vec_env
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
 
@@ -47,7 +49,7 @@ def test_a_finished_run_is_added_to_the_record_at_once(tmp_path):
     result = run(one)
     lines = record.read(path)
     assert lines == record.lines_of(find_finished(tmp_path))
-    assert record.identity_of(one) in {line.run for line in lines}
+    assert identity_of(one) in {line.run for line in lines}
     assert {"toy.csv", "toy.md", "toy.png"} <= {file.name for file in path.parent.iterdir()}
     path.unlink()
     assert run(one) == result and record.read(path) == lines  # of a run that was finished before

@@ -9,7 +9,7 @@ from rich.console import Console
 from stable_baselines3.common.results_plotter import load_results, plot_results, ts2xy
 from zoo_command import call
 
-from wpt_agents.zoo.run.locks import locked
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.run.runner import run
 from wpt_agents.zoo.run.watch import clock, overview, speed, standing
 

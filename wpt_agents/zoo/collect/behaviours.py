@@ -7,6 +7,7 @@ import numpy as np
 import wpt_envs
 
 COLOURS = ("white", "pink", "ou-4", "ou-16", "ou-64")  # ou-n: correlated over n steps
+EXPLORATION_KEYWORDS = ("steps",)  # for `collect --behaviour explore-state`
 AMPLITUDES = (0.3, 1.5)  # standard deviation, drawn once per episode, before clipping to [-1, 1]
 
 Act = Callable[[np.ndarray, dict[str, Any], int], np.ndarray]

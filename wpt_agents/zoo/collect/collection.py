@@ -24,6 +24,7 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.zoo.collect.behaviours import EXPLORATION_KEYWORDS
 from wpt_agents.zoo.collect.curious import Expedition, explore_each
 from wpt_agents.zoo.collect.episodes import (
     SIGMAS,
@@ -38,7 +39,6 @@ from wpt_agents.zoo.collect.episodes import (
 from wpt_agents.zoo.collect.policies import load_policy
 from wpt_agents.zoo.collect.state_curiosity import STAGES, write_stages
 from wpt_agents.zoo.collect.workers import worker_pool
-from wpt_agents.zoo.plan.presets import EXPLORATION_KEYWORDS
 from wpt_agents.zoo.terminal import progress
 
 NOISY = ("scripted", "policy")  # behaviours with noise of `sigmas`

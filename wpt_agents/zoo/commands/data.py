@@ -108,13 +108,9 @@ def collect_data(
 
     Example: `python -m wpt_agents.zoo collect --tasks walker-run --episodes 30 --out data/noise`
     """
+    from wpt_agents.zoo.collect.behaviours import EXPLORATION_KEYWORDS
     from wpt_agents.zoo.collect.collection import collect
-    from wpt_agents.zoo.plan.presets import (
-        EXPLORATION_KEYWORDS,
-        keywords,
-        load_preset,
-        suite_names,
-    )
+    from wpt_agents.zoo.plan.presets import keywords, load_preset, suite_names
     from wpt_agents.zoo.tasks import find_tasks
 
     paper = load_preset(suite, "paper").collect if suite in suite_names() else None

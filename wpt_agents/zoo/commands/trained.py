@@ -56,7 +56,7 @@ def evaluate_model(
     Example: `python -m wpt_agents.zoo eval runs/demo/wpt/metaworld-drawer-close_0 --episodes 50`
     """
     from wpt_agents.zoo.judge.trained import find_trained
-    from wpt_agents.zoo.report.numbers import interval_text, number
+    from wpt_agents.zoo.numbers import interval_text, number
 
     trained = find_trained(run, task)
     score = trained.evaluate(trained.load(policy, device), episodes, seed)
@@ -90,7 +90,7 @@ def enjoy_model(
     Example: `python -m wpt_agents.zoo enjoy runs/demo/wpt/metaworld-drawer-close_0`
     """
     from wpt_agents.zoo.judge.trained import find_trained
-    from wpt_agents.zoo.report.numbers import number
+    from wpt_agents.zoo.numbers import number
 
     if size % 16:
         raise ValueError(f"--size {size}: a video's width must be a multiple of 16.")

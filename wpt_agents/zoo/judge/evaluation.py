@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -10,77 +9,19 @@ import numpy as np
 import wpt_envs
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act
 from wpt_agents.zoo.judge.untrained import State
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.terminal import progress
+from wpt_agents.zoo.vec_envs import make_vec_env
 
 Wrap = Callable[[VecEnv], VecEnv]
 
 PARALLEL = 50  # simulators at once in an evaluation, to bound the memory
-EPISODE = 2  # distinguishes these seeds from those of `plan.runs.EVALUATION`
-
-
-class EpisodeSeeds(gym.Wrapper):
-    """Seed each reset with the number of the episode, so that episodes are independent.
-
-    A seed passed to `reset` is that of episode 0; the seeds of all others are derived from it.
-    """
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.seed = 0
-        self.episode = 0
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start the next episode."""
-        self.seed = self.seed if seed is None else seed
-        return self.env.reset(seed=self.next_seed(), options=options)
-
-    def next_seed(self) -> int:
-        """Return the seed of the next episode, and count that episode as started."""
-        drawn = np.random.SeedSequence([self.seed, EPISODE, self.episode]).generate_state(1)
-        self.episode += 1
-        return int(drawn[0] >> 1) if self.episode > 1 else self.seed
-
-    def go_to_episode(self, number: int) -> None:
-        """Make the next reset start episode `number`."""
-        self.episode = number
-
-
-def make_vec_env(
-    task: str,
-    env: Mapping[str, Any],
-    seed: int,
-    n_envs: int = 1,
-    monitor: str | None = None,
-    workers: bool = False,
-) -> VecEnv:
-    """Make seeded copies of a task, each under SB3's Monitor.
-
-    :param monitor: the Monitor file, which is continued if it exists
-    :param workers: whether to run each copy in its own process
-    """
-    new = monitor is None or not Path(monitor).exists()
-    row = wpt_envs.TASKS.get(task)
-    logged = ("is_success",) if row is not None and row.metric == "success" else ()
-
-    def make() -> gym.Env:
-        import wpt_envs  # noqa: F401  # registers the ids in worker processes
-
-        made = EpisodeSeeds(gym.make(task, **env))
-        return Monitor(made, monitor, info_keywords=logged, override_existing=new)
-
-    venv = SubprocVecEnv([make] * n_envs) if workers else DummyVecEnv([make] * n_envs)
-    venv.seed(seed)
-    return venv
 
 
 def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:

@@ -16,7 +16,7 @@ from rich.table import Table
 from wpt_agents.model.actor_critic import Actor
 from wpt_agents.zoo.judge.diagnosis import Promise
 from wpt_agents.zoo.learning_curves import damaged
-from wpt_agents.zoo.report.numbers import number
+from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.result import PRIOR_ACTOR, read_result
 from wpt_agents.zoo.terminal import console
 

@@ -9,8 +9,8 @@ import numpy as np
 from wpt_agents.files.names import counted
 from wpt_agents.model.sizes import SIZES, Size, find_size
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.report.folders import read_results
 from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.results import read_results
 
 STORED_STEP = 2_500  # bytes of an image in the dataset, which uses lossless compression
 RAW_STEP = 12_288  # bytes of an image in the replay

@@ -7,23 +7,29 @@ from rich.table import Table
 
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.report import record as records
+from wpt_agents.zoo.record_lines import Identity, read
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.sequence_result import read_row
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console, dim
 
 
+def identity_of(job: Run) -> Identity:
+    """Return the identity of the line that the final policy of a run gets."""
+    frames = job.preset.learn.frames
+    return short_name(job.task), job.method, str(job.variant), frames, job.seed
+
+
 def show_plan(jobs: Sequence[Run], force: bool) -> None:
     """Print the plan and what exists already."""
     table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
     record = jobs[0].record
-    lines = records.read(record) if record is not None and record.exists() else []
-    recorded = {line.run for line in lines} & set(map(records.identity_of, jobs))
+    lines = read(record) if record is not None and record.exists() else []
+    recorded = {line.run for line in lines} & set(map(identity_of, jobs))
     for job in jobs:
         done = read_result(job.folder) or read_row(job.folder)
         state = "finished" if done and not force else "to do"
-        if records.identity_of(job) in recorded:
+        if identity_of(job) in recorded:
             state += ", recorded"
         updates = "-" if job.updates is None else f"{job.updates:,}"
         names = short_name(job.task), job.method, str(job.seed)

@@ -13,9 +13,8 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.zoo.collect.behaviours import EXPLORATION_KEYWORDS
 from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
-
-EXPLORATION_KEYWORDS = ("steps",)  # for `collect --behaviour explore-state`
 
 
 @dataclass(frozen=True)

@@ -117,6 +117,7 @@ class Shared:
     def pretraining(self) -> Mapping[str, Any]:
         """The preset's keywords of the agent that affect pre-training."""
         if self.agent is not WPT and issubclass(self.agent, PixelAgent):
-            looked_at = self.agent.keywords.of_stages(Stage.SIZE, Stage.PRETRAINING)
+            stages = Stage.SIZE, Stage.DRAWING, Stage.PRETRAINING
+            looked_at = self.agent.keywords.of_stages(*stages)
             return {k: v for k, v in self.preset.of_agent(self.agent).items() if k in looked_at}
         return {k: v for k, v in self.preset.wpt.items() if k not in FINE_TUNING}

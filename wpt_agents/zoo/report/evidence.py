@@ -10,10 +10,11 @@ from statistics import fmean
 import numpy as np
 
 from wpt_agents.files.names import counted
+from wpt_agents.zoo.numbers import interval_text, number
+from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.aggregates import STATISTICS, normalised, references
 from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
-from wpt_agents.zoo.report.numbers import interval_text, number
-from wpt_agents.zoo.report.record import Line, place
+from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Variant

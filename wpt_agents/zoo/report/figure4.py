@@ -12,11 +12,11 @@ from rich.table import Table
 
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
+from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.report import figures
-from wpt_agents.zoo.report.folders import check_new, unless_damaged
-from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.report.sections import curve
 from wpt_agents.zoo.report.tables import markdown_table
+from wpt_agents.zoo.results import check_new, unless_damaged
 from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
 
 COMPARED = ("wpt", "packnet")

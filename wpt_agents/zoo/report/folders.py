@@ -2,12 +2,11 @@
 
 import base64
 import json
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -15,22 +14,9 @@ import numpy as np
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.learning_curves import EVALUATIONS, Evaluations, damaged
 from wpt_agents.zoo.report.aggregates import Experiment
-from wpt_agents.zoo.result import FILE, Result, read_result
+from wpt_agents.zoo.result import Result, read_result
+from wpt_agents.zoo.results import find_results, unless_damaged
 from wpt_agents.zoo.sequence_result import read_sequence
-
-Content = TypeVar("Content")
-
-
-def unless_damaged(read: Callable[[Path], Content], path: Path) -> Content | None:
-    """Return what `read` reads; None, with a warning, if it raises a ValueError.
-
-    So a damaged file of one run does not hide the other runs.
-    """
-    try:
-        return read(path)
-    except ValueError as error:
-        warnings.warn(f"Left out: {error}", stacklevel=1)
-        return None
 
 
 @dataclass(frozen=True)
@@ -131,29 +117,7 @@ def find_finished(folder: Path) -> list[Finished]:
 
     :raises ValueError: if a run exists twice, which would count as two seeds
     """
-    runs = []
-    seen: dict[object, Path] = {}
-    for path in sorted(folder.glob(f"**/{FILE}")):
-        result = unless_damaged(read_result, path.parent)
-        if result is not None:
-            check_new(result.identity, path.parent, seen)
-            runs.append(Finished(path.parent, result))
-    return runs
-
-
-def check_new(identity: object, folder: Path, seen: dict[object, Path]) -> None:
-    """Raise an error if `seen` has a run of this identity; add it otherwise."""
-    if identity in seen:
-        raise ValueError(
-            f"{seen[identity]} and {folder} are the same run: report one of their folders, or "
-            "delete one of them"
-        )
-    seen[identity] = folder
-
-
-def read_results(folder: Path) -> list[Result]:
-    """Return the results of `find_finished`."""
-    return [run.result for run in find_finished(folder)]
+    return [Finished(path, result) for path, result in find_results(folder).items()]
 
 
 def find_unfinished(folder: Path) -> list[Unfinished]:

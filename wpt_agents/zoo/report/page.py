@@ -10,12 +10,12 @@ import yaml
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted, unknown_name
+from wpt_agents.zoo import numbers
 from wpt_agents.zoo.report import (
     aggregates,
     figure2,
     figure4,
     headline,
-    numbers,
     paper_tables,
     sections,
     steadiness,

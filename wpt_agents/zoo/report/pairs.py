@@ -4,9 +4,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from wpt_agents.zoo.numbers import interval_text, number
+from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.evidence import GAP, Evidence, evidence, task_interval
-from wpt_agents.zoo.report.numbers import interval_text, number
-from wpt_agents.zoo.report.record import Line
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import PRIOR_ACTOR
 from wpt_agents.zoo.statistics import sign_test

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wpt_agents.zoo.numbers import POSSIBLE, evidence_text, seeds_text
 from wpt_agents.zoo.report import aggregates
 from wpt_agents.zoo.report.aggregates import STATISTICS, Reference
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.headline import PAPER_BUDGET
-from wpt_agents.zoo.report.numbers import POSSIBLE, evidence_text, seeds_text
 from wpt_agents.zoo.report.sections import BASELINES, Names
 from wpt_agents.zoo.statistics import mean_interval
 

@@ -21,10 +21,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.record_lines import Identity, Line
 from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.record import Identity, Line, place
+from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.record_picture import PAPER_NAME, STYLES, Style, least, styles_of
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
 

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.locks import locked_folder
+from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report import evidence, pairs, record_curves, record_picture, record_tables
 from wpt_agents.zoo.report import record as records
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.record import Line
-from wpt_agents.zoo.run.locks import locked_folder
 
 INTRODUCTION = """\
 # Recorded scores

@@ -14,9 +14,9 @@ import matplotlib
 import numpy as np
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
 from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
-from wpt_agents.zoo.report.record import Line
 from wpt_agents.zoo.report.record_tables import Key, by_task
 
 matplotlib.use("Agg")  # no display

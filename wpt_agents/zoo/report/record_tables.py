@@ -8,8 +8,9 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from wpt_agents.zoo.report.numbers import ANY, PERCENT, Range, interval_text, number
-from wpt_agents.zoo.report.record import Line, place
+from wpt_agents.zoo.numbers import ANY, PERCENT, Range, interval_text, number
+from wpt_agents.zoo.record_lines import Line
+from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Variant
 from wpt_agents.zoo.statistics import Scores, bootstrap, mean, mean_interval, resamplable

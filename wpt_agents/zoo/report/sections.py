@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from wpt_envs.tasks import TASKS
 
+from wpt_agents.zoo.numbers import evidence_text, span
 from wpt_agents.zoo.plan.methods import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import Aggregate, Estimate, Experiment
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.headline import OURS, PAPER_BUDGET, SUITES
-from wpt_agents.zoo.report.numbers import evidence_text, span
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs

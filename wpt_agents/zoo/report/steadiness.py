@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import Result
 

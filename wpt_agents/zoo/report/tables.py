@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.files.names import counted
+from wpt_agents.zoo.numbers import POSSIBLE, RULE, Range, interval_text, number, seeds_text
 from wpt_agents.zoo.report.aggregates import estimate, references
 from wpt_agents.zoo.report.names import policy_name, policy_title
-from wpt_agents.zoo.report.numbers import POSSIBLE, RULE, Range, interval_text, number, seeds_text
 from wpt_agents.zoo.result import POLICIES, UNTRAINED, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
 

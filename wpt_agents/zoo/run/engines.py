@@ -22,12 +22,12 @@ from rich.markup import escape
 
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.collect.workers import end_with_parent
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.machine import check_machine, import_extra
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run import runner
 from wpt_agents.zoo.run.folder import check_folder, clear
-from wpt_agents.zoo.run.locks import locked
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.run.watch import shown
 from wpt_agents.zoo.terminal import console, logged, say

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.logs import ContinuedCSV
-from wpt_agents.zoo.judge.evaluation import episode_steps, make_vec_env
+from wpt_agents.zoo.judge.evaluation import episode_steps
 from wpt_agents.zoo.learning_curves import MONITOR
 from wpt_agents.zoo.pictures import retrieval
 from wpt_agents.zoo.plan.runs import Run
@@ -32,6 +32,7 @@ from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.tasks import metric_of, name_in_data, short_name
 from wpt_agents.zoo.terminal import say
+from wpt_agents.zoo.vec_envs import make_vec_env
 
 APART = 10_000  # offset between the seeds of evaluations during and after fine-tuning
 

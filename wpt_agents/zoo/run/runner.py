@@ -14,6 +14,7 @@ from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.locks import locked, write_json
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import record_page, tables
@@ -29,7 +30,6 @@ from wpt_agents.zoo.run.checkpoints import (
 from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
 from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
-from wpt_agents.zoo.run.locks import locked, write_json
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.tasks import metric_of, short_name
 from wpt_agents.zoo.terminal import console, say

@@ -26,6 +26,7 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.judge.evaluation import evaluate
+from wpt_agents.zoo.locks import locked, write_json
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.provenance import commit, system
@@ -39,7 +40,6 @@ from wpt_agents.zoo.run.learning import (
     make_agent,
     make_training_env,
 )
-from wpt_agents.zoo.run.locks import locked, write_json
 from wpt_agents.zoo.run.logs import go_to_episode
 from wpt_agents.zoo.run.runner import prepare_logs
 from wpt_agents.zoo.run.shared import collect_data, pretrain

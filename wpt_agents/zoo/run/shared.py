@@ -21,9 +21,9 @@ from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import BASELINES
+from wpt_agents.zoo.locks import locked, write_json
 from wpt_agents.zoo.plan.shared import Shared, key
 from wpt_agents.zoo.result import Score, read_score, write_score
-from wpt_agents.zoo.run.locks import locked, write_json
 from wpt_agents.zoo.terminal import say
 
 

@@ -12,8 +12,8 @@ from rich.live import Live
 from rich.table import Table
 
 from wpt_agents.zoo.learning_curves import MONITOR, TrainingEpisodes
+from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.report.numbers import number
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console
 

@@ -1,0 +1,92 @@
+"""The lines of a record, a CSV file of results, and how they are read."""
+
+import csv
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
+
+Identity = tuple[str, str, str, int, int]  # task, method or policy, preset, frames, seed
+
+
+@dataclass(frozen=True)
+class Line:
+    """The score of one policy of one run.
+
+    :param method: the run's method for its final policy, else the policy's name
+    :param score: 0 to 100 as in the paper: the return / 10, or the share of successes x 100
+    :param hours: hours of the whole run, including shared stages that it executed
+    :param updates: gradient updates of fine-tuning; None where unknown, as in version 0.1
+    :param cpu_hours: CPU hours of fine-tuning by the learner's process; a worker process in which
+        the environment steps, as the model-free agents have, is not counted; None where unknown
+    :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
+        fine-tuning began with; "" without one, or where unknown
+    :param policy: one of `POLICIES`; "" in records of version 0.1
+    """
+
+    suite: str
+    task: str
+    method: str
+    seed: int
+    preset: Variant
+    frames: int
+    score: float
+    return_: float
+    success: float | None
+    hours: float
+    commit: str
+    command: str
+    updates: int | None = None
+    cpu_hours: float | None = None
+    model_hash: str = ""
+    policy: str = ""
+
+    @property
+    def run(self) -> Identity:
+        """The identity of the line."""
+        return self.task, self.method, str(self.preset), self.frames, self.seed
+
+    @property
+    def agent(self) -> Identity:
+        """The identity of the agent, which is the same for "wpt" and "wpt, last"."""
+        clone = self.method.startswith(PRIOR_ACTOR)  # "prior actor, no-pretrain" is another one
+        method = self.method if clone else self.method.split(",")[0]
+        return self.task, method, str(self.preset), self.frames, self.seed
+
+
+COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
+OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy")  # records of version 0.1 lack them
+
+
+def read(path: Path) -> list[Line]:
+    """Read the lines of a record.
+
+    :raises ValueError: if the file is no record or is damaged
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            return [_parse(row) for row in csv.DictReader(file)]
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise ValueError(
+            f"{path} is not a record of runs ({error}); its columns are {', '.join(COLUMNS)}"
+        ) from None
+
+
+PARSERS: Mapping[str, Callable[[str], Any]] = {
+    "seed": int,
+    "preset": Variant.parse,
+    "frames": int,
+    "score": float,
+    "return": float,
+    "success": lambda text: float(text) if text else None,
+    "hours": float,
+    "updates": lambda text: int(text) if text else None,
+    "cpu_hours": lambda text: float(text) if text else None,
+}
+
+
+def _parse(row: Mapping[str, str]) -> Line:
+    cells = {name: row.get(name, "") if name in OPTIONAL else row[name] for name in COLUMNS}
+    return Line(*(PARSERS.get(name, str)(text) for name, text in cells.items()))

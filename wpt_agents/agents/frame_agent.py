@@ -18,7 +18,6 @@ from wpt_agents.data.transitions import Transitions, draw_transitions
 from wpt_agents.data.units import compare_units, in_units_of
 from wpt_agents.model.frame_policy import FramePolicy
 from wpt_agents.training.checks import check_images
-from wpt_agents.training.environments import task_id
 from wpt_agents.training.keywords import (
     Keywords,
     Stage,
@@ -199,11 +198,13 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return bool(self.progress.retrieved_ids) and not self.outdated
 
     def _related(self) -> list[int]:
-        assert self.dataset is not None
-        settings = self.hyperparameters
+        assert self.dataset is not None and self.env is not None
+        settings, task = self.hyperparameters, self.hyperparameters.task
+        if task is None and self.env.has_attr("spec"):
+            task = getattr(self.env.get_attr("spec")[0], "id", None)
         return related_trajectories(
             self.dataset,
-            settings.task if settings.task is not None else task_id(self.env),
+            task,
             settings.embodiment,
             self.policy.action_dim,
             settings.value("num_retrieve"),

@@ -32,7 +32,6 @@ from wpt_agents.model.sizes import Size, find_size
 from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.distributed import joined, local_device
-from wpt_agents.training.environments import task_id
 from wpt_agents.training.guidance import draw_window
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
@@ -193,7 +192,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 index = with_kept(index, kept, self.policy.embed)
             width = self.action_space.shape[0]
             progress.retrieved_ids = retrieve_ids(
-                index, self.dataset, query, width, settings, self.streams, task_id(self.env)
+                index, self.dataset, query, width, settings, self.streams
             )
             progress.retrieved_of = self.dataset.fingerprint
             self.retrieved = None  # those of before, also if the reading below is interrupted

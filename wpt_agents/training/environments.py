@@ -244,17 +244,9 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
 
 def time_limit(env: VecEnv | None) -> int | None:
     """Return the steps after which the environment ends an episode, if it says so."""
-    return getattr(_spec(env), "max_episode_steps", None)
-
-
-def task_id(env: VecEnv | None) -> str | None:
-    """Return the id that the environment is registered by, None if it has none."""
-    return getattr(_spec(env), "id", None)
-
-
-def _spec(env: VecEnv | None) -> Any:
     assert env is not None
-    return env.get_attr("spec")[0] if env.has_attr("spec") else None
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    return getattr(spec, "max_episode_steps", None)
 
 
 def last_observation(

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from zlib import crc32
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +23,6 @@ def retrieve_ids(
     width: int,
     settings: Hyperparameters,
     streams: Streams,
-    task: str | None = None,
 ) -> list[int]:
     """Return the numbers of the R trajectories that begin most like the task.
 
@@ -33,7 +31,6 @@ def retrieve_ids(
 
     :param query: (Q, E), e(o) of the first images of Q episodes of the task
     :param width: the number of actions
-    :param task: the environment's id; without one, random trajectories are the same for all tasks
     :raises ValueError: no trajectory has that many actions
     """
     names = set(dataset.embodiments)
@@ -48,7 +45,7 @@ def retrieve_ids(
         )
     number = settings.value("num_retrieve")
     if settings.retrieval == "random":
-        rng = streams.numpy(Purpose.RETRIEVE, crc32((task or "").encode()))
+        rng = streams.numpy(Purpose.RETRIEVE, 0)
         numbers = retriever.draw(number, rng, known, width)
     else:
         numbers, _ = retriever.search(query, number, known, width)

@@ -53,7 +53,7 @@ class SavedAgent(KeywordAgent):
     action_space: spaces.Box
     _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
     _last_episode_starts: Any
-    _resets_seen: int | None = None  # when the environment was last in our hands
+    _resets_seen: int | None = None  # when the agent last used its environment
 
     def __init__(
         self,

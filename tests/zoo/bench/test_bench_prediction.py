@@ -64,6 +64,21 @@ def test_a_model_dreams_the_same_at_every_call_and_sees_the_context_alone():
     assert not np.array_equal(dreamt, prediction.dream(agent())(replace(batch, image=later)))
 
 
+def test_the_mean_of_samples_is_their_mean_and_errs_less_than_they_do():
+    batch, model = prediction.windows(clock(50), 1, 4), agent()
+    generator = torch.Generator().manual_seed(0)
+    world_model = model.policy.world_model
+    samples = [world_model.open_loop(batch, 5, generator).numpy() for _ in range(3)]
+    assert not np.array_equal(samples[0], samples[1])
+    mean = prediction.dream(model, 3)(batch)
+    np.testing.assert_allclose(mean, sum(x.astype(float) for x in samples) / 3, rtol=1e-5)
+    true = batch.image.numpy()
+    alone = np.mean([prediction.squared_error(true, x) for x in samples], 0)
+    spread = np.mean([prediction.squared_error(mean, x) for x in samples], 0)
+    together = prediction.squared_error(true, mean)
+    np.testing.assert_allclose(together, alone - spread, rtol=1e-3)  # variance leaves the error
+
+
 def test_the_last_episodes_of_each_task_are_held_out(tmp_path):
     with TrajectoryDataset.create(tmp_path / "data") as data:
         for speed in range(1, 7):  # three episodes of each of two tasks
@@ -247,6 +262,13 @@ def test_open_loop_compares_several_models_by_name(pre_trained):
     alone = list(prediction.judge({"x": WPT.load(pre_trained / "other.zip")},
                                   TrajectoryDataset.open(data), 8))  # fmt: skip
     assert alone[0]["+1"] == pytest.approx(of["longer"][1], abs=0.1)
+    ran = CliRunner().invoke(app, [*words, "--beside", other, "--samples", "2"])
+    assert ran.exit_code == 0, ran.output
+    table = pd.read_csv(pre_trained / "seen" / "prediction.csv")
+    assert list(table.prediction.unique()) == [
+        *("world model", "world model, mean of 2", "longer", "longer, mean of 2"),
+        *("copy last frame", "mean frame"),
+    ]
     for wrong, message in (
         (["--beside", "other.zip"], "NAME=MODEL with a new name, not other.zip"),
         (["--beside", other, "--beside", other], "with a new name"),

@@ -157,6 +157,14 @@ def judge_predictions(
             "repeated.",
         ),
     ] = None,
+    samples: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            help="If more than 1, also measure the mean of this many sampled predictions, which is "
+            "the model's best guess of an uncertain future.",
+        ),
+    ] = 1,
     device: Device = "auto",
 ) -> None:
     """Measure how well a world model predicts: its error at each horizon, beside simple baselines.
@@ -178,7 +186,7 @@ def judge_predictions(
             raise ValueError(f"--beside must be NAME=MODEL with a new name, not {words}")
         chosen[name] = other
     models = {name: WPT.load(model_file(one), device=device) for name, one in chosen.items()}
-    rows = judge(models, TrajectoryDataset.open(data), episodes, out)
+    rows = judge(models, TrajectoryDataset.open(data), episodes, out, samples)
     print_table("Squared error of an image, as in Eq. (1)", list(rows))
     if out is not None:
         typer.echo(f"Pictures: {out.resolve()}")

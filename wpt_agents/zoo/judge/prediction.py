@@ -34,6 +34,7 @@ def judge(
     dataset: TrajectoryDataset,
     episodes: int,
     folder: Path | None = None,
+    samples: int = 1,
 ) -> Iterator[dict[str, Any]]:
     """Compare world models with copying the last frame and with the mean frame, for each robot.
 
@@ -41,6 +42,8 @@ def judge(
     :param dataset: held-out data, whose mean frame is one of the baselines
     :param episodes: maximum number for each robot, evenly spaced over those that are long enough
     :param folder: the folder of the pictures
+    :param samples: if more than 1, a further row of each model shows the error of the mean of that
+        many sampled predictions
     :raises ValueError: if no trajectory is long enough, if one has too many actions, or if the
         models differ in `max_action_dim`
     """
@@ -73,7 +76,11 @@ def judge(
         chosen = dataset.subset(candidates[spread])
         tests[robot] = [windows(trajectory, 3, width) for trajectory in chosen]
         ways[robot] = {
-            **{name: dream(model) for name, model in models.items()},
+            **{
+                name if number == 1 else f"{name}, mean of {number}": dream(model, number)
+                for name, model in models.items()
+                for number in dict.fromkeys((1, samples))
+            },
             "copy last frame": copy_last_frame,
             "mean frame": MeanFrame(chosen),
         }
@@ -124,13 +131,21 @@ def windows(trajectory: Trajectory, number: int, width: int) -> Batch:
     return stack_windows([led_to(trajectory, s, s + length, width) for s in starts])
 
 
-def dream(model: WPT) -> Predict:
-    """Predict open-loop with the world model, with one sample of the latents."""
+def dream(model: WPT, samples: int = 1) -> Predict:
+    """Predict open-loop with the world model: the mean image of some samples of the latents.
+
+    Where the future is uncertain, the expected squared error of one sample is up to twice that of
+    the mean of many, which is the best prediction by this error.
+    """
 
     def predict(batch: Batch) -> np.ndarray:
         generator = Generator(model.device).manual_seed(0)
         batch = batch.to(model.device)
-        return model.policy.world_model.open_loop(batch, CONTEXT, generator).cpu().numpy()
+        futures = [
+            model.policy.world_model.open_loop(batch, CONTEXT, generator).cpu().numpy()
+            for _ in range(samples)
+        ]
+        return futures[0] if samples == 1 else np.mean(futures, 0, np.float32)
 
     return predict
 

@@ -24,8 +24,8 @@ ROOT = Path(__file__).parents[1]
 WIDTHS = (390, 820, 1440)
 SCHEMES = ("light", "dark")
 PAGES = (
-    *("index", "quickstart", "data", "results", "when-it-does-not-learn", "api/model", "search"),
-    *("algorithms/drqv2", "tutorials/4-a-row-of-the-paper"),
+    *("index", "quickstart", "data", "results", "experiments", "when-it-does-not-learn"),
+    *("api/model", "search", "algorithms/drqv2", "tutorials/4-a-row-of-the-paper"),
 )
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),

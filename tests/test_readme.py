@@ -125,10 +125,10 @@ def test_no_table_is_broken_by_an_empty_line(name):
         assert len(rows) > 2 and re.fullmatch(r"\|( ?-+ ?\|)+", rows[1]), table
 
 
-def test_the_versions_in_the_results_lie_within_the_bounds():
+def test_the_versions_on_the_page_of_experiments_lie_within_the_bounds():
     packaging = import_module("packaging.specifiers")
     project = (ROOT / "pyproject.toml").read_text()
-    tested = section("Versions that work together", PAGES["results.md"])
+    tested = section("Versions that work together", PAGES["experiments.md"])
     versions = re.findall(r"([a-z0-9_-]+)\s(\d+\.\d+\.\d+)", tested)
     assert len(versions) >= 9
     for name, version in versions:

@@ -110,7 +110,8 @@ def test_the_sheet_of_a_run_shows_what_the_run_retrieves(dataset, images, tmp_pa
 
 def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, monkeypatch, capsys):
     agent(DotEnv()).save(tmp_path / "model.zip")
-    words = [dataset.path, "--model", tmp_path / "model.zip", "--out", tmp_path / "found.png"]
+    # of a folder, as that of a run or of a pre-training, its model file is used
+    words = [dataset.path, "--model", tmp_path, "--out", tmp_path / "found.png"]
     assert call(monkeypatch, "retrieve", "show", *words, "--query", 3, "--number", 1) == 0
     assert str(tmp_path / "found.png") in capsys.readouterr().out.replace("\n", "")
     shown = colours(tmp_path / "found.png")

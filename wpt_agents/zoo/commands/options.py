@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -57,6 +58,11 @@ Workers = Annotated[
         "`--engine local`.",
     ),
 ]
+
+
+def model_file(model: str) -> str:
+    """Return what `WPT.load` takes: the file of a folder, or the argument itself."""
+    return str(Path(model, "model.zip")) if Path(model).is_dir() else model
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from wpt_agents.zoo.commands.options import Rendering, Suite
+from wpt_agents.zoo.commands.options import Rendering, Suite, model_file
 
 HELP = """\
 Show or measure what retrieval finds.
@@ -21,9 +21,10 @@ Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
 def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
     model: Annotated[
-        Path,
+        str,
         typer.Option(
-            help="A model file, or the name of a shipped model, whose encoder compares the images."
+            help="The model whose encoder compares the images: a file, the folder of a run or of a "
+            "pre-training, or the name of a shipped model."
         ),
     ],
     query: Annotated[
@@ -59,7 +60,7 @@ def show_retrieval(
     from wpt_agents.zoo.pictures import datasets, retrieval
     from wpt_agents.zoo.tasks import find_tasks
 
-    agent = WPT.load(model, dataset=folder)
+    agent = WPT.load(model_file(model), dataset=folder)
     assert agent.dataset is not None
     queries = [retrieval.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
@@ -77,7 +78,8 @@ def share_retrieval(
     model: Annotated[
         str,
         typer.Option(
-            help="A model file, or the name of a shipped model, whose encoder compares the images."
+            help="The model whose encoder compares the images: a file, the folder of a run or of a "
+            "pre-training, or the name of a shipped model."
         ),
     ],
     task: Annotated[list[str], typer.Option(help="Tasks whose first images are the queries.")],
@@ -101,7 +103,7 @@ def share_retrieval(
     from wpt_agents.zoo.judge.retrieved import own_task_shares
     from wpt_agents.zoo.tasks import find_tasks
 
-    agent = WPT.load(model, dataset=folder)
+    agent = WPT.load(model_file(model), dataset=folder)
     look = {"rendering": str(rendering)}
     typer.echo(f"{'first images':28}" + "".join(f"{count:7}" for count in images))
     for name, shares in own_task_shares(agent, find_tasks(suite, task), images, number, look, seed):

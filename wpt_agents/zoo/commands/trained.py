@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from wpt_agents.zoo.commands.options import Device, Rendering, Suite, Tasks, print_table
+from wpt_agents.zoo.commands.options import (
+    Device,
+    Rendering,
+    Suite,
+    Tasks,
+    model_file,
+    print_table,
+)
 
 RunFolder = Annotated[
     Path,
@@ -36,11 +43,6 @@ ModelArgument = Annotated[
         "model."
     ),
 ]
-
-
-def model_file(model: str) -> str:
-    """Return what `WPT.load` takes: the file of a folder, or the argument itself."""
-    return str(Path(model, "model.zip")) if Path(model).is_dir() else model
 
 
 def evaluate_model(

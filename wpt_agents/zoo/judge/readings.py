@@ -5,6 +5,7 @@ row has only the columns that were logged since the last one.
 """
 
 import csv
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,9 +61,10 @@ def readings(
         floor = f"{narrowest_entropy(actions):.2f} with means of 0 and the smallest deviations"
         rows.append(Reading(what, f"{entropy.value:.2f}", floor))
     what = "imagined reward of the same actions, largest difference"
-    rows.append(
-        Reading(what, f"{100 * largest_difference(promised):.0f} %", "of the earned reward")
-    )
+    largest = largest_difference(promised)
+    share = f"{100 * largest:.0f} %" if math.isfinite(largest) else "undefined"
+    beside = "of the earned reward" if math.isfinite(largest) else "a step earned nothing"
+    rows.append(Reading(what, share, beside))
     result = read_result(folder)
     if result is not None and PRIOR_ACTOR in result.scores:
         metric = "success rate" if result.metric == "success" else "mean return"

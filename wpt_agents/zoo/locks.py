@@ -1,15 +1,12 @@
-"""Locks on folders that several processes write to, and atomic JSON files."""
+"""Locks on folders that several processes write to."""
 
 import fcntl
-import json
 import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
-
-from wpt_agents.files.archive import replacing
+from typing import IO
 
 PATIENCE = 0.5  # seconds to wait for a lock, because `zoo watch` acquires each one briefly
 
@@ -52,9 +49,3 @@ def _taken(file: IO[str], wait: bool) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` to `path` atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")

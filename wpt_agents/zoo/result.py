@@ -6,7 +6,6 @@ Example::
     result.final.mean, result.scores["prior actor"].success_rate, result.command
 """
 
-import json
 import shlex
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
@@ -16,7 +15,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.json_files import read_json, write_json
 from wpt_agents.zoo.statistics import mean_interval
 
 FILE = "result.json"
@@ -222,30 +221,25 @@ def read_result(folder: Path) -> Result | None:
 
     :raises ValueError: if the file is damaged
     """
-    path = folder / FILE
-    if not path.exists():
-        return None
-    try:
-        return _from_json(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
+    return read_json(folder / FILE, _from_json)
 
 
 def write_result(folder: Path, result: Result) -> None:
     """Write the result of the run in `folder` atomically."""
-    with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(_to_json(result), indent=1), encoding="utf-8")
+    write_json(folder / FILE, _to_json(result))
 
 
 def read_score(path: Path) -> Score | None:
-    """Read the score in a separate file; return None if there is no such file."""
-    return Score.of(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+    """Read the score in a separate file; return None if there is no such file.
+
+    :raises ValueError: if the file is damaged
+    """
+    return read_json(path, Score.of)
 
 
 def write_score(path: Path, score: Score) -> None:
     """Write one score to a separate file atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_score_json(score), indent=1), encoding="utf-8")
+    write_json(path, _score_json(score))
 
 
 def _to_json(result: Result) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.locks import locked, write_json
+from wpt_agents.zoo.json_files import write_json
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit, system
 from wpt_agents.zoo.report import record_page, tables

@@ -25,8 +25,9 @@ from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.json_files import write_json
 from wpt_agents.zoo.judge.evaluation import evaluate
-from wpt_agents.zoo.locks import locked, write_json
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.provenance import commit, system

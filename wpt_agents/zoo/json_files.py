@@ -1,0 +1,29 @@
+"""JSON files that are written atomically, and whose damage is reported with their path."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from wpt_agents.files.archive import replacing
+
+Content = TypeVar("Content")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` to `path` atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
+
+
+def read_json(path: Path, build: Callable[[Any], Content]) -> Content | None:
+    """Return what `build` makes of the value in a file, None if there is no such file.
+
+    :raises ValueError: if the file is damaged
+    """
+    if not path.exists():
+        return None
+    try:
+        return build(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None

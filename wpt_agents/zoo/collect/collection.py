@@ -45,6 +45,7 @@ NOISY = ("scripted", "policy")  # behaviours with noise of `sigmas`
 CURIOUS = (STATE_CURIOSITY, *EXPLORERS)  # behaviours with `settings`
 BEHAVIOURS = ("random", "noise", *NOISY, *CURIOUS)
 EPISODES_A_JOB = 4
+LABEL = "collect.json"  # beside the data: `Recipe.label`, tasks and episodes
 Work = TypeVar("Work")
 Result = TypeVar("Result")
 
@@ -248,12 +249,12 @@ def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
 
 def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     """Return the dataset to append to: a new one, or the unfinished one of the same call."""
-    label = path / "collect.json"
+    label = path / LABEL
     dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
         with replacing(label) as temporary:
             temporary.write_text(json.dumps(description, indent=1), encoding="utf-8")
-    stored = _read_label(label) if label.exists() else {}
+    stored = read_label(path)
     differ = [key for key in {**description, **stored} if stored.get(key) != description.get(key)]
     if differ:
         raise ValueError(
@@ -263,9 +264,14 @@ def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     return dataset
 
 
-def _read_label(file: Path) -> dict[str, Any]:
+def read_label(folder: Path) -> dict[str, Any]:
+    """Return how a dataset was collected, empty if its folder does not say it.
+
+    :raises ValueError: if the file is damaged
+    """
+    file = folder / LABEL
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     except ValueError as error:
         raise ValueError(
             f"{file} is damaged ({error}); restore the file, or use another path"

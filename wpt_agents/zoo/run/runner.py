@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.zoo.judge.trained import final_model
 from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import commit
@@ -25,7 +26,7 @@ from wpt_agents.zoo.run.checkpoints import (
     last_checkpoint,
     remove_checkpoints,
 )
-from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
+from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash
 from wpt_agents.zoo.run.folder import check_folder, clear, described
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
 from wpt_agents.zoo.run.shared import collect_data, pretrain

@@ -22,13 +22,11 @@ from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
-from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.locks import locked
-from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.plan.sequences import SequenceRun
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.run.checkpoints import Checkpoint, Origin, last_checkpoint
+from wpt_agents.zoo.run.evaluating import play
 from wpt_agents.zoo.run.folder import check_config, clear, described
 from wpt_agents.zoo.run.learning import (
     build_index,
@@ -153,7 +151,7 @@ def _learn_task(job: SequenceRun, number: int) -> Row:
         agent.save(run.folder / "model.zip")
     made = sum(row.updates for row in map(read_row, _folders(job, number)) if row is not None)
     scores = {
-        short_name(played.task): _play(played, policy_of(agent, place))
+        short_name(played.task): play(played, policy_of(agent, place), short_name(played.task))
         for place, played in enumerate(job.runs[: number + 1])
     }
     return Row(
@@ -214,17 +212,3 @@ def _keep(agent: BaseAlgorithm, folders: Sequence[Path]) -> None:
 def policy_of(agent: BaseAlgorithm, task: int) -> PolicyPredictor:
     """Return the policy for a task of the sequence; PackNet has one for each task."""
     return agent.policy_of(task) if isinstance(agent, PackNet) else agent
-
-
-def _play(run: Run, policy: PolicyPredictor) -> Score:
-    episodes = run.preset.evaluate.episodes
-    name = short_name(run.task)
-    return evaluate(
-        policy,
-        run.task.id,
-        run.shared.env,
-        episodes,
-        run.evaluation_seed,
-        name,
-        run.algorithm.wrap,
-    )

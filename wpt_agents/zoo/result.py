@@ -7,7 +7,7 @@ Example::
 """
 
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import total_ordering
 from pathlib import Path
@@ -206,14 +206,23 @@ class Result:
     @property
     def command(self) -> str:
         """A command that repeats the run from any working directory."""
-        words = ["python", "-m", "wpt_agents.zoo", "run", "--suite", self.suite]
-        words += ["--tasks", self.task, "--method", self.method, "--preset", self.variant.preset]
-        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
-        for change in self.variant.changes:
-            words += ["--set", str(change)]
-        if self.variant.data is not None:
-            words += ["--data", self.variant.data]
-        return shlex.join(words)
+        task = ["--suite", self.suite, "--tasks", self.task]
+        return run_command(task, self.method, self.variant, self.frames, self.seed)
+
+
+def run_command(task: Sequence[str], method: str, variant: Variant, frames: int, seed: int) -> str:
+    """Return the command that makes a run.
+
+    :param task: the options that name its task, or its sequence of tasks
+    """
+    words = ["python", "-m", "wpt_agents.zoo", "run", *task]
+    words += ["--method", method, "--preset", variant.preset]
+    words += ["--frames", str(frames), "--seeds", f"{seed}-{seed}"]
+    for change in variant.changes:
+        words += ["--set", str(change)]
+    if variant.data is not None:
+        words += ["--data", variant.data]
+    return shlex.join(words)
 
 
 def read_result(folder: Path) -> Result | None:

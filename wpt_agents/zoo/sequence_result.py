@@ -6,14 +6,13 @@ Example::
     result.rows[2].scores["dmc-quadruped-stand"].mean  # the first task, after the third
 """
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from wpt_agents.zoo.json_files import read_json, write_json
-from wpt_agents.zoo.result import Change, Score, Variant
+from wpt_agents.zoo.result import Change, Score, Variant, run_command
 
 FILE = "sequence.json"
 ROW = "scores.json"  # in the folder of each task that is finished
@@ -76,14 +75,8 @@ class SequenceResult:
     @property
     def command(self) -> str:
         """A command that repeats the runs of the sequence."""
-        words = ["python", "-m", "wpt_agents.zoo", "run", "--sequence", self.sequence]
-        words += ["--method", self.method, "--preset", self.variant.preset]
-        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
-        for change in self.variant.changes:
-            words += ["--set", str(change)]
-        if self.variant.data is not None:
-            words += ["--data", self.variant.data]
-        return shlex.join(words)
+        task = ["--sequence", self.sequence]
+        return run_command(task, self.method, self.variant, self.frames, self.seed)
 
 
 def write_row(folder: Path, row: Row) -> None:

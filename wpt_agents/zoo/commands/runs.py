@@ -233,7 +233,7 @@ def run_benchmark(
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
-    from wpt_agents.zoo.plan.sequences import make_sequences
+    from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
     from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
@@ -242,7 +242,8 @@ def run_benchmark(
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: pre-train with it, then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
-    if from_nothing and load_preset(suite, preset).pretrain.model:
+    preset_suite = find_sequence(sequence).suite if sequence else suite
+    if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
     limits = cpus, gpus, memory_gb, hours, retries
     resources = Resources(workers, *limits, address, partition)

@@ -12,15 +12,12 @@ from dataclasses import dataclass, fields
 from itertools import chain
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.pictures.style import plt
 from wpt_agents.zoo.record_lines import Identity, Line
 from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence

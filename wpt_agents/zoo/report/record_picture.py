@@ -10,19 +10,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.pictures.style import plt
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
 from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
 from wpt_agents.zoo.report.record_tables import Key, by_task
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 PANELS = 8  # up to this number of tasks each has a panel
 

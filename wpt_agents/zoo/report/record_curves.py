@@ -23,7 +23,15 @@ from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.record import place
-from wpt_agents.zoo.report.record_picture import PAPER_NAME, STYLES, Style, least, styles_of
+from wpt_agents.zoo.report.record_picture import (
+    PAPER_NAME,
+    STYLES,
+    Style,
+    least,
+    legend_of,
+    save,
+    styles_of,
+)
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
 
 COLUMNS = 5  # panels in a row
@@ -138,9 +146,7 @@ def draw(record: Path, points: Sequence[Point], lines: Sequence[Line]) -> None:
     for panel in axes.flat[len(panels) :]:
         panel.remove()
     _legend(figure)
-    with replacing(place_of(record).with_suffix(".png")) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
+    save(figure, place_of(record).with_suffix(".png"))
 
 
 Curves = dict[str, dict[int, list[float]]]  # method -> frames -> the score of each seed
@@ -185,11 +191,7 @@ def _draw_panel(
 
 
 def _legend(figure: Figure) -> None:
-    labels = {
-        label: handle
-        for panel in figure.axes
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-    }
+    labels = legend_of(figure)
     figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=4, fontsize=8)
     figure.supxlabel("thousand frames", fontsize=8)
     figure.supylabel("score, 0 to 100", fontsize=8)

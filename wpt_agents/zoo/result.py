@@ -15,8 +15,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from wpt_agents.zoo.json_files import read_json, write_json
 from wpt_agents.zoo.statistics import mean_interval
+from wpt_agents.zoo.text_files import read_json, write_json
 
 FILE = "result.json"
 

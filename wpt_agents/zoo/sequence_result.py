@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wpt_agents.zoo.json_files import read_json, write_json
 from wpt_agents.zoo.result import Change, Score, Variant, run_command
+from wpt_agents.zoo.text_files import read_json, write_json
 
 FILE = "sequence.json"
 ROW = "scores.json"  # in the folder of each task that is finished

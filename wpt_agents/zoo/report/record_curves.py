@@ -5,10 +5,9 @@ the table keeps them.
 """
 
 import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -16,9 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.pictures.style import plt
-from wpt_agents.zoo.record_lines import Identity, Line
+from wpt_agents.zoo.record_lines import Identity, Line, csv_of
 from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence
 from wpt_agents.zoo.report.folders import Finished
@@ -33,6 +31,7 @@ from wpt_agents.zoo.report.record_picture import (
     styles_of,
 )
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
+from wpt_agents.zoo.text_files import write_text
 
 COLUMNS = 5  # panels in a row
 
@@ -81,19 +80,12 @@ def points_of(runs: Iterable[Finished]) -> Iterator[Point]:
 
 def update(record: Path, points: Iterable[Point]) -> list[Point]:
     """Add points to the curves of a record, in place of those of the same runs; return all."""
-    path = place_of(record)
     points = list(points)
     again = {point.run for point in points}
     before = [point for point in read(record) if point.run not in again]
     every = sorted([*before, *points], key=lambda p: (p.suite, *p.run, p.at))
     if every:
-        names = [field.name for field in fields(Point)]
-        file = io.StringIO()
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([getattr(point, name) for name in names] for point in every)
-        with replacing(path) as temporary:
-            temporary.write_text(file.getvalue(), encoding="utf-8")
+        write_text(place_of(record), csv_of(Point, every))
     return every
 
 

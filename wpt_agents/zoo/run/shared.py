@@ -18,13 +18,13 @@ from wpt_agents.files.names import counted, unknown_name
 from wpt_agents.training.distributed import World
 from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.collect.collection import collect, read_label
-from wpt_agents.zoo.json_files import write_json
 from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.shared import Shared, key
 from wpt_agents.zoo.result import Score, read_score, write_score
 from wpt_agents.zoo.terminal import say
+from wpt_agents.zoo.text_files import write_json
 
 
 def collect_data(shared: Shared) -> TrajectoryDataset:

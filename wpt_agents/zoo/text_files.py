@@ -1,4 +1,4 @@
-"""JSON files that are written atomically, and whose damage is reported with their path."""
+"""Text and JSON files: written atomically, and read with an error that names a damaged one."""
 
 import json
 from collections.abc import Callable
@@ -10,10 +10,15 @@ from wpt_agents.files.archive import replacing
 Content = TypeVar("Content")
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write `value` to `path` atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
+    write_text(path, json.dumps(value, indent=1))
 
 
 def read_json(path: Path, build: Callable[[Any], Content]) -> Content | None:

@@ -1,8 +1,9 @@
-"""Checks of what a command needs on this machine: an engine's package, a GPU."""
+"""What a command needs on this machine, an engine's package or a GPU, and its threads."""
 
 import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -43,6 +44,17 @@ def check_device(device: str) -> None:
             f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
             "GPUs here; use --device cpu, or a build of torch with CUDA and a driver"
         )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread, so that sums have a fixed order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def choose_threads(size: str | Size | Mapping[str, Any]) -> None:

@@ -19,6 +19,7 @@ from wpt_agents.zoo.bench.timing import (
     peak_rss_mb,
     seconds_in_turn,
 )
+from wpt_agents.zoo.machine import one_thread
 
 ACTIONS = 6
 CASES = (  # size, batch, length; `bench scaling` shows what grows with each
@@ -75,7 +76,7 @@ def measured_in_turn(
     work = [gflop(step) for step in counted or steps]
     memory = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    alone = [on_one_thread(step) for step in steps] if threads > 1 and device == "cpu" else []
+    alone = [one_thread()(step) for step in steps] if threads > 1 and device == "cpu" else []
     limits = {"ceiling_gflop_per_s": matmul(device=device)}
     limits |= {"onednn_gflop_per_s": onednn()} if device == "cpu" else {}
     timings = seconds_in_turn([*limits.values(), *steps, *alone], repetitions)
@@ -103,20 +104,6 @@ def measured_in_turn(
             }
         )
     return rows
-
-
-def on_one_thread(step: Callable[[], Any]) -> Callable[[], None]:
-    """Return the step with a single thread of torch."""
-
-    def alone() -> None:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            step()
-        finally:
-            torch.set_num_threads(threads)
-
-    return alone
 
 
 def _peak_mb(step: Callable[[], Any]) -> float:

@@ -8,7 +8,6 @@ Example::
 import json
 import os
 import shutil
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -37,7 +36,7 @@ from wpt_agents.zoo.collect.episodes import (
     robot_of,
 )
 from wpt_agents.zoo.collect.policies import load_policy
-from wpt_agents.zoo.collect.state_curiosity import STAGES, write_stages
+from wpt_agents.zoo.collect.state_curiosity import STAGES, exploration_folder, write_stages
 from wpt_agents.zoo.collect.workers import worker_pool
 from wpt_agents.zoo.terminal import progress
 
@@ -108,15 +107,18 @@ def collect(
         )
     if dataset.appended == total:
         return dataset
-    label, gather = f"collect {behaviour}", _collect_played
+    gather = _collect_played
     if behaviour in EXPLORERS:
         gather = _collect_curious
     if behaviour == STATE_CURIOSITY:
         gather = _collect_state_curious
+    label = f"collect {behaviour}"
     with dataset:
         dataset.reserve()  # before counting the missing episodes
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
             gather(dataset, tasks, episodes, recipe, workers, bar)
+        for folder in dataset.path.glob("exploring-*"):
+            shutil.rmtree(folder)
     return TrajectoryDataset.open(path)
 
 
@@ -138,8 +140,6 @@ def _collect_state_curious(
     _collect_played(
         dataset, tasks, episodes, replace(recipe, stages=str(dataset.path)), workers, bar
     )
-    for folder in dataset.path.glob("exploring-*"):
-        shutil.rmtree(folder)
 
 
 def _collect_played(
@@ -177,7 +177,7 @@ def _collect_curious(
             episodes,
             recipe.seed,
             recipe.behaviour,
-            dataset.path / f"exploring-{zlib.crc32(task.encode()):08x}",
+            exploration_folder(dataset.path, task),
             partial(make_env, task, recipe),
             recipe.settings,
             robot_of(task),
@@ -195,8 +195,6 @@ def _collect_curious(
         dataset.extend(gathered.subset(range(dataset.appended % episodes, episodes)))
         dataset.flush()
     moved(len(trips) * episodes)
-    for folder in dataset.path.glob("exploring-*"):
-        shutil.rmtree(folder)
 
 
 def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:

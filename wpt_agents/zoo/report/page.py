@@ -97,7 +97,7 @@ def render(
         both=headline.both_suites(results),
         commits=sorted({result.commit_name for result in results}),
         seeds=sorted({result.seed for result in results}),
-        paper_budget=headline.PAPER_BUDGET,
+        paper_budget=aggregates.PAPER_BUDGET,
     )
 
 

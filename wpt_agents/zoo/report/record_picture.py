@@ -17,8 +17,9 @@ from matplotlib.figure import Figure
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.pictures.style import plt
 from wpt_agents.zoo.record_lines import Line
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
-from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.headline import SUITES
 from wpt_agents.zoo.report.record_tables import Cell, Key, by_task
 
 PANELS = 8  # up to this number of tasks each has a panel

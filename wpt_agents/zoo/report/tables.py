@@ -12,7 +12,7 @@ from rich.table import Table
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.numbers import POSSIBLE, RULE, Range, interval_text, number, seeds_text
 from wpt_agents.zoo.record_lines import csv_of
-from wpt_agents.zoo.report.aggregates import estimate, references
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, estimate, references
 from wpt_agents.zoo.report.names import policy_name, policy_title
 from wpt_agents.zoo.result import POLICIES, UNTRAINED, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
@@ -149,7 +149,7 @@ def paper_scores() -> dict[tuple[str, str], float]:
     return {
         (row.task, row.method): row.score
         for row in references()
-        if row.samples == 150_000 and row.score is not None
+        if row.samples == PAPER_BUDGET and row.score is not None
     }
 
 

@@ -31,7 +31,7 @@ from wpt_agents.zoo.bench.model import (
     whole_step,
     world_model_step,
 )
-from wpt_agents.zoo.run.engines import import_extra
+from wpt_agents.zoo.machine import import_extra
 
 REPETITIONS = 3
 HORIZON = 15  # imagined steps in the peers' own configurations

@@ -54,7 +54,7 @@ def render(
     runs: Sequence[Finished],
     unfinished: Sequence[Unfinished],
     media: str = "first",
-    sequences: Sequence[figure4.Finished] = (),
+    sequences: Sequence[figure4.SequenceFolder] = (),
 ) -> str:
     """Return the page's HTML."""
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")

@@ -28,7 +28,7 @@ from wpt_agents.zoo.run.checkpoints import (
     Origin,
     resumes,
 )
-from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
+from wpt_agents.zoo.run.logs import EvaluationCallback, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.tasks import metric_of, name_in_data, short_name
 from wpt_agents.zoo.terminal import say
@@ -181,7 +181,7 @@ def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
         return
     venv = make_vec_env(run.task.id, run.shared.env, run.evaluation_seed + APART)
     with closing(run.algorithm.wrap(venv) if run.algorithm.wrap else venv) as wrapped:
-        callback = Evaluations(
+        callback = EvaluationCallback(
             wrapped,
             metric=metric_of(run.task),
             keep=run.folder / BEST_MODEL if settings.keep_best else None,

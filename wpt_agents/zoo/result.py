@@ -102,7 +102,7 @@ class Variant:
 
     @property
     def playing(self) -> Self:
-        """Return the changes that affect untrained policies: env and evaluation settings."""
+        """The preset with the changes that affect untrained policies: env and evaluation."""
         changes = tuple(c for c in self.changes if c.key.startswith(("env.", "evaluate.")))
         return type(self)(self.preset, changes)
 

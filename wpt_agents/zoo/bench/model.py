@@ -66,7 +66,7 @@ def measured_in_turn(
     repetitions: int,
     counted: Sequence[Callable[[], Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """Yield a row for each step, alternating with the ceiling: time, work, memory.
+    """Return a row for each step, alternating with the ceiling: time, work, memory.
 
     With several CPU threads, each step is also timed on a single thread: `times_one_thread`.
 

@@ -67,7 +67,7 @@ class Recipe:
     stages: str | None = None
 
     def label(self) -> dict[str, Any]:
-        """Return the content of `collect.json`: seed, behaviour, env, and non-default settings."""
+        """Return a part of `collect.json`: seed, behaviour, env, and non-default settings."""
         always, default = ("seed", "behaviour", "env"), vars(Recipe())
         changed = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
         return json.loads(json.dumps(changed))

@@ -117,7 +117,7 @@ def diagnose(
 ) -> Diagnosis:
     """Play episodes with a trained model and compare its predictions with actual rewards.
 
-    :raises ValueError: if an episode is not longer than `horizon`
+    :raises ValueError: if the model is not WPT's, or if an episode is shorter than `horizon`
     """
     model = trained.load(device=device)
     if not isinstance(model, WPT):

@@ -130,7 +130,7 @@ def final_model(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Origin:
-    """Return the task, environment and method of the model in a run folder."""
+    """The task, environment and method of the model in a run folder."""
 
     task: str
     env: Mapping[str, Any] = field(default_factory=dict)

@@ -169,10 +169,7 @@ def draw_panels(lines: Sequence[Line]) -> Figure:
 
 
 class PanelRow(NamedTuple):
-    """A method's scores in a panel.
-
-    :param height: in lines of text, those of the label and half a line between rows
-    """
+    """A method's scores in a panel."""
 
     label: str
     scores: Sequence[float]
@@ -180,7 +177,7 @@ class PanelRow(NamedTuple):
 
     @property
     def height(self) -> float:
-        """The number of lines that the row takes."""
+        """The lines of text that the row takes: those of its label, half a line between rows."""
         return self.label.count("\n") + 1.5
 
 

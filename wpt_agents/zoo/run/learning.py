@@ -141,7 +141,7 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None, origin:
     if checkpoint is not None:
         before = Effort(checkpoint.state.seconds, checkpoint.state.cpu_seconds)
         resume(run, agent, checkpoint)
-    every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up: 0 means none
+    every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up, so that only 0 stays 0
     checkpoints = Checkpoints(
         run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds, origin
     )

@@ -99,7 +99,7 @@ def overview(jobs: Sequence[Run]) -> Table:
 
 
 def clock(seconds: float) -> str:
-    """'1:02:03'."""
+    """Format a duration as '1:02:03'."""
     minutes, rest = divmod(round(max(seconds, 0)), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 

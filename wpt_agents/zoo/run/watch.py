@@ -1,17 +1,16 @@
 """The progress of the runs of a plan, one line each, read from their folders."""
 
-import fcntl
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from rich.live import Live
 from rich.table import Table
 
 from wpt_agents.zoo.learning_curves import MONITOR, TrainingEpisodes
+from wpt_agents.zoo.locks import is_locked
 from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.tasks import short_name
@@ -48,7 +47,7 @@ def standing(job: Run) -> Standing:
         return Standing("failed", steps, recent)
     if not (folder / "config.yaml").exists():
         return Standing("waiting")
-    if not is_locked(folder):
+    if not is_locked(folder / "lock"):
         return Standing("stopped", steps, recent)
     if not len(played):
         return Standing("preparing")
@@ -64,19 +63,6 @@ def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
     if len(times) < 2 or times[-1] <= times[0]:
         return None
     return float(lengths[1:].sum() / (times[-1] - times[0]))
-
-
-def is_locked(folder: Path) -> bool:
-    """Return whether a process works on the run, on any machine if the file system has locks."""
-    path = folder / "lock"
-    if not path.exists():
-        return False
-    with open(path, encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
 
 
 def overview(jobs: Sequence[Run]) -> Table:

@@ -7,9 +7,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from wpt_agents.zoo.result import NOTHING, RANDOM
+
 Observation = np.ndarray | dict[str, np.ndarray]
-
-
 State = tuple[np.ndarray, ...]
 
 
@@ -49,6 +49,6 @@ class RandomPolicy:
 
 
 BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
-    "nothing": lambda space, seed: DoNothing(space),
-    "random": RandomPolicy,
+    NOTHING: lambda space, seed: DoNothing(space),
+    RANDOM: RandomPolicy,
 }

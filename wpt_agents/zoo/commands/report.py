@@ -68,11 +68,11 @@ def report(
     runs = find_finished(folder)
     results = [run.result for run in runs]
     sequences = figures_4(find_sequences(folder))
-    kept = records.read(record) if not results and record is not None and record.exists() else []
-    if record is not None and kept:
+    if not results and record is not None and record.exists() and records.read(record):
         record_page.renew(record)
-        kept_as = f"No finished run below {folder}: {record} stays, its pages are renewed."
-        console.print(kept_as, markup=False)
+        console.print(
+            f"No finished run below {folder}: {record} stays, its pages are renewed.", markup=False
+        )
         if not sequences:
             return
     if not results and not sequences:

@@ -72,7 +72,8 @@ def measured_in_turn(
 
     :param counted: the same steps uncompiled, because the work of compiled code cannot be counted
     """
-    steps, threads = [step for step, _ in cases], torch.get_num_threads()
+    steps = [step for step, _ in cases]
+    threads = torch.get_num_threads()
     work = [gflop(step) for step in counted or steps]
     memory = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -86,8 +87,9 @@ def measured_in_turn(
     times = timings[len(limits) :]
     rows = []
     for i, (_, columns) in enumerate(cases):
-        (processor, wall), flops, peak = times[i], work[i], memory[i]
+        processor, wall = times[i]
         median = cost(processor, wall)
+        speed = work[i] / median
         faster = {"times_one_thread": times[len(cases) + i][1] / wall} if alone else {}
         rows.append(
             {
@@ -95,11 +97,11 @@ def measured_in_turn(
                 "threads": threads,
                 "median_s": median,
                 "wall_s": wall,
-                "gflop": flops,
-                "gflop_per_s": flops / median,
-                "share_of_ceiling": flops / median / rates["ceiling_gflop_per_s"],
+                "gflop": work[i],
+                "gflop_per_s": speed,
+                "share_of_ceiling": speed / rates["ceiling_gflop_per_s"],
                 **rates,
-                "rss_mb": peak,
+                "rss_mb": memory[i],
                 **faster,
             }
         )

@@ -99,7 +99,8 @@ def collect(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
     description = {"tasks": list(tasks), "episodes": episodes, **recipe.label()}
-    dataset, total = _open(Path(path), description), len(tasks) * episodes
+    dataset = _open(Path(path), description)
+    total = len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
             f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "

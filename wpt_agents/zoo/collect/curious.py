@@ -58,7 +58,8 @@ def explore(trip: Expedition) -> Iterator[int]:
 
 def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explorer:
     """Return a new agent, or the one that played the stored episodes."""
-    kind, file = EXPLORERS[trip.behaviour], trip.folder / "explorer.zip"
+    kind = EXPLORERS[trip.behaviour]
+    file = trip.folder / "explorer.zip"
     if not file.exists():
         assert env.action_space.shape is not None
         keywords = {**EXPLORE, "max_action_dim": env.action_space.shape[0], **trip.settings}

@@ -68,7 +68,8 @@ class Recipe:
 
     def label(self) -> dict[str, Any]:
         """Return a part of `collect.json`: seed, behaviour, env, and non-default settings."""
-        always, default = ("seed", "behaviour", "env"), vars(Recipe())
+        always = "seed", "behaviour", "env"
+        default = vars(Recipe())
         changed = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
         return json.loads(json.dumps(changed))
 

@@ -245,8 +245,16 @@ def run_benchmark(
     preset_suite = find_sequence(sequence).suite if sequence else suite
     if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
-    limits = cpus, gpus, memory_gb, hours, retries
-    resources = Resources(workers, *limits, address, partition)
+    resources = Resources(
+        workers=workers,
+        cpus=cpus,
+        gpus=gpus,
+        memory_gb=memory_gb,
+        hours=hours,
+        retries=retries,
+        address=address,
+        partition=partition,
+    )
     check_resources(engine, resources)
     if record is not None:
         if sequence or watch:
@@ -255,8 +263,7 @@ def run_benchmark(
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
-        where = out, workers, device, data
-        jobs = make_sequences(sequence, preset, seeds, method, changes, *where)
+        jobs = make_sequences(sequence, preset, seeds, method, changes, out, workers, device, data)
         if not do_sequences(jobs, force, dry_run):
             raise typer.Exit(1)
         return

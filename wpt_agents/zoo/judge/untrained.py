@@ -34,7 +34,8 @@ class RandomPolicy:
     """A policy with uniform actions in the action space."""
 
     def __init__(self, action_space: spaces.Box, seed: int) -> None:
-        self.action_space, self.rng = action_space, np.random.default_rng(seed)
+        self.action_space = action_space
+        self.rng = np.random.default_rng(seed)
 
     def predict(
         self,

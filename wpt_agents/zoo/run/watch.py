@@ -71,7 +71,8 @@ def overview(jobs: Sequence[Run]) -> Table:
     for heading in ("frames", "done", "return", "steps/s", "time left"):
         table.add_column(heading, justify="right")
     for job in jobs:
-        now, steps = standing(job), job.preset.steps
+        now = standing(job)
+        steps = job.preset.steps
         left = (steps - now.steps) / now.speed if now.speed else None
         table.add_row(
             *(short_name(job.task), job.method, str(job.seed), now.state),

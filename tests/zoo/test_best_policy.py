@@ -11,7 +11,7 @@ from wpt_envs import TASKS
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.zoo.run.checkpoints import HEAD_START_MODEL, HeadStart
-from wpt_agents.zoo.run.logs import Evaluations
+from wpt_agents.zoo.run.logs import EvaluationCallback
 from wpt_agents.zoo.tasks import metric_of
 from wpt_agents.zoo.vec_envs import EpisodeSeeds
 
@@ -40,7 +40,7 @@ def kept(folder, metric, parts=(35,)):
     for steps in parts:
         with closing(DummyVecEnv([lambda: EpisodeSeeds(Monitor(ClockEnv()))])) as venv:
             keywords = {"n_eval_episodes": 2, "eval_freq": 7, "log_path": str(folder), "verbose": 0}
-            callback = Evaluations(venv, metric, folder / "best_model.zip", **keywords)
+            callback = EvaluationCallback(venv, metric, folder / "best_model.zip", **keywords)
             model.learn(steps, callback=callback, reset_num_timesteps=False)
     return WPT.load(folder / "best_model.zip").num_timesteps
 
@@ -62,7 +62,7 @@ def test_a_run_that_resumes_keeps_the_best_of_all_its_parts(tmp_path, played, me
 
 def test_without_a_file_to_keep_none_is_written(tmp_path, played):
     with closing(DummyVecEnv([lambda: EpisodeSeeds(Monitor(ClockEnv()))])) as venv:
-        callback = Evaluations(
+        callback = EvaluationCallback(
             venv, n_eval_episodes=2, eval_freq=7, log_path=str(tmp_path), verbose=0
         )
         agent(ClockEnv()).learn(14, callback=callback)

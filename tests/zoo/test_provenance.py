@@ -1,4 +1,5 @@
 import platform
+from importlib.metadata import PackageNotFoundError, version
 
 from wpt_agents.zoo import provenance
 
@@ -24,3 +25,14 @@ def test_record_names_the_processor_on_systems_without_cpuinfo(monkeypatch):
     monkeypatch.setattr(provenance, "cpu_model", lambda: "arm")
     monkeypatch.setattr(platform, "processor", lambda: "arm")
     assert provenance.cpu() == "arm"
+
+
+def test_a_run_needs_no_simulator_that_is_not_installed(monkeypatch):
+    def without_dm_control(name):  # it has no wheel for Python 3.13
+        if name == "dm-control":
+            raise PackageNotFoundError(name)
+        return version(name)
+
+    assert provenance.system()["versions"].keys() == set(provenance.PACKAGES)
+    monkeypatch.setattr(provenance, "version", without_dm_control)
+    assert provenance.system()["versions"].keys() == set(provenance.PACKAGES) - {"dm-control"}

@@ -4,7 +4,16 @@ import json
 
 import pytest
 
-from wpt_agents.zoo.result import Change, Result, Score, Variant, read_result, write_result
+from wpt_agents.zoo.result import (
+    Change,
+    Result,
+    Score,
+    Variant,
+    read_result,
+    read_score,
+    write_result,
+)
+from wpt_agents.zoo.sequence_result import read_row
 
 RESULT = Result(
     suite="dmc",
@@ -84,3 +93,13 @@ def test_no_file_is_no_result_and_a_damaged_one_is_named(tmp_path):
     (tmp_path / "result.json").write_text('{"suite": "dmc"}')
     with pytest.raises(ValueError, match=r"result.json is damaged.*delete it"):
         read_result(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"returns": 1}'])
+def test_a_damaged_score_of_a_policy_or_of_a_task_is_named(tmp_path, content):
+    (tmp_path / "random.json").write_text(content)
+    with pytest.raises(ValueError, match=r"random.json is damaged.*delete it"):
+        read_score(tmp_path / "random.json")
+    (tmp_path / "scores.json").write_text(content)
+    with pytest.raises(ValueError, match=r"scores.json is damaged.*delete it"):
+        read_row(tmp_path)

@@ -1,15 +1,12 @@
-"""Locks on folders that several processes write to, and atomic JSON files."""
+"""Locks on folders that several processes write to."""
 
 import fcntl
-import json
 import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
-
-from wpt_agents.files.archive import replacing
+from typing import IO
 
 PATIENCE = 0.5  # seconds to wait for a lock, because `zoo watch` acquires each one briefly
 
@@ -24,7 +21,7 @@ def locked(path: Path, wait: bool = False) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", encoding="utf-8") as file:
         until = time.monotonic() + PATIENCE
-        while not _taken(file, wait):
+        while not _taken(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)):
             if time.monotonic() > until:
                 raise ValueError(
                     f"{path.parent} is being worked on by another process: wait for it, or use "
@@ -46,15 +43,18 @@ def locked_folder(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _taken(file: IO[str], wait: bool) -> bool:
+def is_locked(path: Path) -> bool:
+    """Return whether a process is in a `locked` block, on any machine if the file system can."""
+    if not path.exists():
+        return False
+    with open(path, encoding="utf-8") as file:
+        return not _taken(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+
+def _taken(file: IO[str], kind: int) -> bool:
+    """Take a lock of `flock`; return False if another process has it."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(file, kind)
     except BlockingIOError:
         return False
     return True
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` to `path` atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")

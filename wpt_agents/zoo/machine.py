@@ -1,8 +1,9 @@
-"""Checks of what a command needs on this machine: an engine's package, a GPU."""
+"""What a command needs on this machine, an engine's package or a GPU, and its threads."""
 
 import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -18,8 +19,12 @@ def import_extra(name: str, extra: str) -> ModuleType:
     """Import the module of an extra, or raise an error with the command that installs it."""
     try:
         return importlib.import_module(name)
-    except ImportError:
+    except ModuleNotFoundError:
         raise ValueError(f'{name} is not installed: pip install "wpt-agents[{extra}]"') from None
+    except ImportError as error:  # for example of a shared library, or of another version
+        raise ValueError(
+            f'{name} cannot be imported ({error}): pip install "wpt-agents[{extra}]"'
+        ) from error
 
 
 def check_machine(engine: str, device: str) -> None:
@@ -43,6 +48,17 @@ def check_device(device: str) -> None:
             f"--device {device}: torch {torch.__version__} finds {torch.cuda.device_count()} CUDA "
             "GPUs here; use --device cpu, or a build of torch with CUDA and a driver"
         )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread, so that sums have a fixed order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def choose_threads(size: str | Size | Mapping[str, Any]) -> None:

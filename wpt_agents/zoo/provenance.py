@@ -3,8 +3,9 @@
 import platform
 import shutil
 import subprocess
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ import torch
 
 from wpt_agents.fast.products import cpu_model
 
-PACKAGES = ("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
-
-
-SIMULATORS = ("dm-control", "metaworld")
+PACKAGES = (
+    *("wpt-agents", "torch", "numpy", "gymnasium", "stable-baselines3", "mujoco"),
+    *("dm-control", "metaworld"),
+)
 
 
 @cache
@@ -50,6 +51,15 @@ def cpu() -> str:
     return ", ".join((fields["model name"], *numbers))
 
 
+def versions() -> dict[str, str]:
+    """Return the versions of the packages; a simulator may not be installed, as on Python 3.13."""
+    installed = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return installed
+
+
 def system() -> dict[str, Any]:
     """Return the machine and the versions of a run."""
     return {
@@ -59,5 +69,5 @@ def system() -> dict[str, Any]:
         "cpu": cpu(),
         "threads": torch.get_num_threads(),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "versions": {name: version(name) for name in PACKAGES + SIMULATORS},
+        "versions": versions(),
     }

@@ -1,7 +1,8 @@
-"""The lines of a record, a CSV file of results, and how they are read."""
+"""The lines of a record, a CSV file of results, and how they are read and written."""
 
 import csv
-from collections.abc import Callable, Mapping
+import io
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -90,3 +91,19 @@ PARSERS: Mapping[str, Callable[[str], Any]] = {
 def _parse(row: Mapping[str, str]) -> Line:
     cells = {name: row.get(name, "") if name in OPTIONAL else row[name] for name in COLUMNS}
     return Line(*(PARSERS.get(name, str)(text) for name, text in cells.items()))
+
+
+def csv_of(kind: type, rows: Iterable[Any]) -> str:
+    """Return objects of a dataclass as CSV, a column for each field.
+
+    The values of a tuple are in one cell, separated by spaces. The underscore at the end of
+    `return_`, which is a word of Python, is not in the name of its column.
+    """
+    names = [field.name for field in fields(kind)]
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(name.rstrip("_") for name in names)
+    for row in rows:
+        values = [getattr(row, name) for name in names]
+        writer.writerow(" ".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
+    return file.getvalue()

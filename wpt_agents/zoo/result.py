@@ -6,9 +6,8 @@ Example::
     result.final.mean, result.scores["prior actor"].success_rate, result.command
 """
 
-import json
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import total_ordering
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.statistics import mean_interval
+from wpt_agents.zoo.text_files import read_json, write_json
 
 FILE = "result.json"
 
@@ -103,7 +102,7 @@ class Variant:
 
     @property
     def playing(self) -> Self:
-        """Return the changes that affect untrained policies: env and evaluation settings."""
+        """The preset with the changes that affect untrained policies: env and evaluation."""
         changes = tuple(c for c in self.changes if c.key.startswith(("env.", "evaluate.")))
         return type(self)(self.preset, changes)
 
@@ -207,14 +206,23 @@ class Result:
     @property
     def command(self) -> str:
         """A command that repeats the run from any working directory."""
-        words = ["python", "-m", "wpt_agents.zoo", "run", "--suite", self.suite]
-        words += ["--tasks", self.task, "--method", self.method, "--preset", self.variant.preset]
-        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
-        for change in self.variant.changes:
-            words += ["--set", str(change)]
-        if self.variant.data is not None:
-            words += ["--data", self.variant.data]
-        return shlex.join(words)
+        task = ["--suite", self.suite, "--tasks", self.task]
+        return run_command(task, self.method, self.variant, self.frames, self.seed)
+
+
+def run_command(task: Sequence[str], method: str, variant: Variant, frames: int, seed: int) -> str:
+    """Return the command that makes a run.
+
+    :param task: the options that name its task, or its sequence of tasks
+    """
+    words = ["python", "-m", "wpt_agents.zoo", "run", *task]
+    words += ["--method", method, "--preset", variant.preset]
+    words += ["--frames", str(frames), "--seeds", f"{seed}-{seed}"]
+    for change in variant.changes:
+        words += ["--set", str(change)]
+    if variant.data is not None:
+        words += ["--data", variant.data]
+    return shlex.join(words)
 
 
 def read_result(folder: Path) -> Result | None:
@@ -222,30 +230,25 @@ def read_result(folder: Path) -> Result | None:
 
     :raises ValueError: if the file is damaged
     """
-    path = folder / FILE
-    if not path.exists():
-        return None
-    try:
-        return _from_json(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
+    return read_json(folder / FILE, _from_json)
 
 
 def write_result(folder: Path, result: Result) -> None:
     """Write the result of the run in `folder` atomically."""
-    with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(_to_json(result), indent=1), encoding="utf-8")
+    write_json(folder / FILE, _to_json(result))
 
 
 def read_score(path: Path) -> Score | None:
-    """Read the score in a separate file; return None if there is no such file."""
-    return Score.of(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+    """Read the score in a separate file; return None if there is no such file.
+
+    :raises ValueError: if the file is damaged
+    """
+    return read_json(path, Score.of)
 
 
 def write_score(path: Path, score: Score) -> None:
     """Write one score to a separate file atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_score_json(score), indent=1), encoding="utf-8")
+    write_json(path, _score_json(score))
 
 
 def _to_json(result: Result) -> dict[str, Any]:

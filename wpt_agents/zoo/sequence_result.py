@@ -6,15 +6,13 @@ Example::
     result.rows[2].scores["dmc-quadruped-stand"].mean  # the first task, after the third
 """
 
-import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.result import Change, Score, Variant
+from wpt_agents.zoo.result import Change, Score, Variant, run_command
+from wpt_agents.zoo.text_files import read_json, write_json
 
 FILE = "sequence.json"
 ROW = "scores.json"  # in the folder of each task that is finished
@@ -77,33 +75,26 @@ class SequenceResult:
     @property
     def command(self) -> str:
         """A command that repeats the runs of the sequence."""
-        words = ["python", "-m", "wpt_agents.zoo", "run", "--sequence", self.sequence]
-        words += ["--method", self.method, "--preset", self.variant.preset]
-        words += ["--frames", str(self.frames), "--seeds", f"{self.seed}-{self.seed}"]
-        for change in self.variant.changes:
-            words += ["--set", str(change)]
-        if self.variant.data is not None:
-            words += ["--data", self.variant.data]
-        return shlex.join(words)
+        task = ["--sequence", self.sequence]
+        return run_command(task, self.method, self.variant, self.frames, self.seed)
 
 
 def write_row(folder: Path, row: Row) -> None:
     """Write the scores at the end of a task atomically."""
-    with replacing(folder / ROW) as temporary:
-        temporary.write_text(json.dumps(asdict(row), indent=1), encoding="utf-8")
+    write_json(folder / ROW, asdict(row))
 
 
 def read_row(folder: Path) -> Row | None:
-    """Read the file of `write_row`; return None if the task is not finished."""
-    path = folder / ROW
-    return _row(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+    """Read the file of `write_row`; return None if the task is not finished.
+
+    :raises ValueError: if the file is damaged
+    """
+    return read_json(folder / ROW, _row)
 
 
 def write_sequence(folder: Path, result: SequenceResult) -> None:
     """Write the result of a sequence atomically."""
-    stored = asdict(result) | {"command": result.command}
-    with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(stored, indent=1), encoding="utf-8")
+    write_json(folder / FILE, asdict(result) | {"command": result.command})
 
 
 def read_sequence(folder: Path) -> SequenceResult | None:
@@ -111,18 +102,15 @@ def read_sequence(folder: Path) -> SequenceResult | None:
 
     :raises ValueError: if the file is damaged
     """
-    path = folder / FILE
-    if not path.exists():
-        return None
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        stored.pop("command")
-        variant = stored.pop("variant")
-        variant["changes"] = tuple(sorted(Change(**c).short for c in variant["changes"]))
-        rows = [_row(row) for row in stored.pop("rows")]
-        return SequenceResult(variant=Variant(**variant), rows=rows, **stored)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged ({error!r}); delete it and run again") from None
+    return read_json(folder / FILE, _sequence)
+
+
+def _sequence(stored: dict[str, Any]) -> SequenceResult:
+    stored.pop("command")
+    variant = stored.pop("variant")
+    variant["changes"] = tuple(sorted(Change(**c).short for c in variant["changes"]))
+    rows = [_row(row) for row in stored.pop("rows")]
+    return SequenceResult(variant=Variant(**variant), rows=rows, **stored)
 
 
 def _row(stored: dict[str, Any]) -> Row:

@@ -96,7 +96,8 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float | None, float |
 
     That of two values is 13 times as wide as their difference, and says less than the two values.
     """
-    middle, n = float(np.mean(values)), len(values)
+    middle = float(np.mean(values))
+    n = len(values)
     if n < 3:
         return middle, None, None
     t = T_975[n - 2] if n - 2 < len(T_975) else 1.96 + 2.4 / (n - 1)  # accurate to 0.005

@@ -95,6 +95,15 @@ def test_from_nothing_pre_trains_where_a_preset_starts_from_a_shipped_model(
     assert "world model  2,500 updates to make" in capsys.readouterr().out
 
 
+def test_from_nothing_looks_at_the_presets_of_the_sequence(monkeypatch, capsys, tmp_path):
+    words = ["--sequence", "ant", "--suite", "robotics", "--preset", "mid", "--dry-run"]
+    words += ["--out", tmp_path / "runs"]
+    assert call(monkeypatch, "run", *words) == 0
+    assert "world model  dmc-mid, which ships" in capsys.readouterr().out
+    assert call(monkeypatch, "run", *words, "--from-nothing") == 0
+    assert "world model  3,000 updates to make" in capsys.readouterr().out
+
+
 def test_from_nothing_changes_no_label_where_a_preset_pre_trains_anyway(monkeypatch, tmp_path):
     planned = []
     monkeypatch.setattr(

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,6 +191,12 @@ def test_the_card_tells_scores_command_and_how_to_load(tmp_path):
     assert header["library_name"] == "wpt-agents"
     for text in ("| wpt | 710 |", "seed 3", "--tasks dmc-walker-run", "zoo pull me/walker"):
         assert text in page
+    assert "Commit 0123456789ab. Made by:" in page
+
+
+def test_the_card_of_a_run_outside_a_checkout_says_that_its_commit_is_unknown(tmp_path):
+    result = read_result(make_run(tmp_path, "dmc-walker-run"))
+    assert "Commit unknown. Made by:" in card(replace(result, commit=None), "me/walker")
 
 
 def test_what_was_pushed_is_pulled_the_same(tmp_path, hub):  # noqa: F811

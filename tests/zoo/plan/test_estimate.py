@@ -22,6 +22,8 @@ from wpt_agents.zoo.plan.estimate import (
     summary,
 )
 from wpt_agents.zoo.plan.overview import show_plan
+from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.sequence_result import Row, write_row
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -46,6 +48,16 @@ def test_a_plan_counts_the_episodes_that_a_dataset_lacks(tmp_path, capsys):
         dataset.extend(recorded() for _ in range(3))
     show_plan([one], force=False)
     assert "dataset      exists" in capsys.readouterr().out
+
+
+def test_a_finished_task_of_a_sequence_needs_no_more_space(tmp_path):
+    runs = [replace(job(tmp_path, "scratch", seed), sequence="dots") for seed in range(2)]
+    left = disk_needed(runs[1:])
+    assert disk_needed(runs) > left
+    score = Score((1.0,))
+    runs[0].folder.mkdir(parents=True)
+    write_row(runs[0].folder, Row("dmc-dot", {"dmc-dot": score}, 1, 1.0, 1.0))
+    assert disk_needed(runs) == left
 
 
 def test_networks_of_ones_own_widths_count_as_the_next_larger_ones():

@@ -90,6 +90,8 @@ def test_a_job_that_fails_before_its_run_begins_says_why_in_its_log(tmp_path, mo
         raise ValueError("worked on by another process")
 
     one = job(tmp_path)
+    one.folder.mkdir(parents=True)
+    (one.folder / "error.txt").write_text("RuntimeError: of an earlier time\n")
     monkeypatch.setattr(engines.runner, "run", refuse)
     with pytest.raises(ValueError, match="another process"):
         engines.do(one)

@@ -10,7 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from wpt_agents.zoo.result import Result, Score, Variant, read_result, write_result
-from wpt_agents.zoo.run.logs import Evaluations
+from wpt_agents.zoo.run.logs import EvaluationCallback
 from wpt_agents.zoo.vec_envs import EpisodeSeeds
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -23,7 +23,7 @@ def evaluating(folder, steps):
 
 def evaluations_in(folder):
     venv = DummyVecEnv([lambda: EpisodeSeeds(Monitor(ClockEnv()))])
-    return Evaluations(venv, n_eval_episodes=1, eval_freq=7, log_path=str(folder), verbose=0)
+    return EvaluationCallback(venv, n_eval_episodes=1, eval_freq=7, log_path=str(folder), verbose=0)
 
 
 def evaluations(folder):

@@ -196,6 +196,14 @@ def test_a_dataset_of_ones_own_takes_the_place_of_the_presets(tmp_path):
     assert job(tmp_path, data=data.rename(tmp_path / "moved")).shared.model_path == path
 
 
+def test_a_damaged_label_of_ones_own_data_is_named(tmp_path):
+    with TrajectoryDataset.create(tmp_path / "own") as dataset:
+        dataset.append(recorded())
+    (tmp_path / "own" / "collect.json").write_text('{"env": {')
+    with pytest.raises(ValueError, match=r"collect\.json is damaged .*restore"):
+        collect_data(job(tmp_path, data=tmp_path / "own").shared)
+
+
 def test_a_run_goes_on_with_the_same_data_alone(tmp_path):
     data = collect_data(job(tmp_path).shared).path.rename(tmp_path / "own")
     run(job(tmp_path, data=data))

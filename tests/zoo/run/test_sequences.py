@@ -119,8 +119,8 @@ def killing(function, at):
     ("method", "owner", "name", "at"),
     [
         ("packnet", PackNet, "_retrain", 0),  # the second task begins by pruning the first
-        ("packnet", sequences, "_play", 1),  # the second task is learned, but has no scores yet
-        ("wpt", sequences, "_play", 1),
+        ("packnet", sequences, "play", 1),  # the second task is learned, but has no scores yet
+        ("wpt", sequences, "play", 1),
         ("wpt", sequences, "learn", 1),  # before the second task's first step
         ("wpt", sequences, "write_sequence", 0),  # the first task's scores are written alone
     ],

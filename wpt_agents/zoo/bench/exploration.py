@@ -49,7 +49,7 @@ class Watched(gym.Wrapper):
         self.states: list[np.ndarray] = []
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One step."""
+        """Take a step and record the state that it ends in."""
         result = self.env.step(action)
         self.states.append(result[-1]["state"])
         return result

@@ -19,6 +19,7 @@ from wpt_agents.zoo.bench.timing import (
     peak_rss_mb,
     seconds_in_turn,
 )
+from wpt_agents.zoo.machine import one_thread
 
 ACTIONS = 6
 CASES = (  # size, batch, length; `bench scaling` shows what grows with each
@@ -65,17 +66,18 @@ def measured_in_turn(
     repetitions: int,
     counted: Sequence[Callable[[], Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """Yield a row for each step, alternating with the ceiling: time, work, memory.
+    """Return a row for each step, alternating with the ceiling: time, work, memory.
 
     With several CPU threads, each step is also timed on a single thread: `times_one_thread`.
 
     :param counted: the same steps uncompiled, because the work of compiled code cannot be counted
     """
-    steps, threads = [step for step, _ in cases], torch.get_num_threads()
+    steps = [step for step, _ in cases]
+    threads = torch.get_num_threads()
     work = [gflop(step) for step in counted or steps]
     memory = [_peak_mb(step) for step in steps]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    alone = [on_one_thread(step) for step in steps] if threads > 1 and device == "cpu" else []
+    alone = [one_thread()(step) for step in steps] if threads > 1 and device == "cpu" else []
     limits = {"ceiling_gflop_per_s": matmul(device=device)}
     limits |= {"onednn_gflop_per_s": onednn()} if device == "cpu" else {}
     timings = seconds_in_turn([*limits.values(), *steps, *alone], repetitions)
@@ -85,8 +87,9 @@ def measured_in_turn(
     times = timings[len(limits) :]
     rows = []
     for i, (_, columns) in enumerate(cases):
-        (processor, wall), flops, peak = times[i], work[i], memory[i]
+        processor, wall = times[i]
         median = cost(processor, wall)
+        speed = work[i] / median
         faster = {"times_one_thread": times[len(cases) + i][1] / wall} if alone else {}
         rows.append(
             {
@@ -94,29 +97,15 @@ def measured_in_turn(
                 "threads": threads,
                 "median_s": median,
                 "wall_s": wall,
-                "gflop": flops,
-                "gflop_per_s": flops / median,
-                "share_of_ceiling": flops / median / rates["ceiling_gflop_per_s"],
+                "gflop": work[i],
+                "gflop_per_s": speed,
+                "share_of_ceiling": speed / rates["ceiling_gflop_per_s"],
                 **rates,
-                "rss_mb": peak,
+                "rss_mb": memory[i],
                 **faster,
             }
         )
     return rows
-
-
-def on_one_thread(step: Callable[[], Any]) -> Callable[[], None]:
-    """Return the step with a single thread of torch."""
-
-    def alone() -> None:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            step()
-        finally:
-            torch.set_num_threads(threads)
-
-    return alone
 
 
 def _peak_mb(step: Callable[[], Any]) -> float:

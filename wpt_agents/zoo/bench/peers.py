@@ -31,7 +31,7 @@ from wpt_agents.zoo.bench.model import (
     whole_step,
     world_model_step,
 )
-from wpt_agents.zoo.run.engines import import_extra
+from wpt_agents.zoo.machine import import_extra
 
 REPETITIONS = 3
 HORIZON = 15  # imagined steps in the peers' own configurations
@@ -96,7 +96,8 @@ def sheeprl(size: Size, batch: Batch) -> Learner:
     """The `dreamer_v3` of sheeprl, with the architecture of 2023 and its own training functions."""
     theirs = needed("sheeprl.algos.dreamer_v3.dreamer_v3")
     theirs.MetricAggregator.disabled = True  # without logging statistics
-    cfg, fabric = sheeprl_config(size), theirs.Fabric(accelerator="cpu", devices=1)
+    cfg = sheeprl_config(size)
+    fabric = theirs.Fabric(accelerator="cpu", devices=1)
     world, actor, critic, target, _ = theirs.build_agent(
         fabric, (ACTIONS,), True, cfg, Dict({"rgb": Box(0, 255, (3, 64, 64), np.uint8)})
     )
@@ -105,7 +106,8 @@ def sheeprl(size: Size, batch: Batch) -> Learner:
     optimizers = fabric.setup_optimizers(
         *(instantiate(c.optimizer, params=net.parameters()) for net, c in parts)
     )
-    data, nets = sheeprl_batch(batch), (world, actor, critic, target)
+    data = sheeprl_batch(batch)
+    nets = world, actor, critic, target
     rest = None, cfg, True, (ACTIONS,), theirs.Moments()
     return Learner(
         f"sheeprl {version('sheeprl')}",
@@ -232,7 +234,8 @@ def torchrl_config(size: Size) -> dict[str, Any]:
 
 def torchrl_batch(size: Size, batch: Batch) -> Any:
     """Its layout: an action beside the image that it led to, channels first."""
-    shape, no = batch.reward.shape, torch.zeros_like(batch.is_first[..., None])
+    shape = batch.reward.shape
+    no = torch.zeros_like(batch.is_first[..., None])
     return needed("tensordict").TensorDict(
         {
             "state": torch.zeros(*shape, size.stoch * size.classes),

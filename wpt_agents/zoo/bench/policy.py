@@ -25,7 +25,8 @@ def rows(quick: bool = False, threads: int = 1) -> Iterator[dict]:
         params = count(policy.world_model.encoder, policy.world_model.rssm, policy.actor)
         for n in counts:
             image = np.random.default_rng(0).integers(0, 256, (n, 64, 64, 3)).astype(np.uint8)
-            state, first = policy.initial_state(n), np.zeros(n, bool)
+            state = policy.initial_state(n)
+            first = np.zeros(n, bool)
             act = partial(policy.act, image, state, first)
             forms: dict[str, Callable[[], Any]] = {
                 "policy step": act,

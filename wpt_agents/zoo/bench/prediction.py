@@ -161,7 +161,8 @@ def of(dataset: TrajectoryDataset, *robots: str) -> TrajectoryDataset:
 def predictors(plan: Plan, dataset: TrajectoryDataset) -> dict[str, dict[str, Predict]]:
     """Return the models to compare by robot and name; train those that do not exist."""
     robots = list(dict.fromkeys(str(robot) for robot in dataset.embodiments))
-    budget, scratch = f"{plan.further} updates", f"scratch-{plan.further}"
+    budget = f"{plan.further} updates"
+    scratch = f"scratch-{plan.further}"
     from_scratch = train(plan, scratch, of(dataset, LEFT_OUT), plan.further)
     generalist = train(plan, "generalist", dataset, plan.updates)
     untrained = WPT("WPTPolicy", seed=0, **plan.model)

@@ -37,7 +37,8 @@ def rows(quick: bool = False) -> Iterator[dict]:
 
 def filled(frames: int) -> ReplayBuffer:
     """Return episodes of 500 steps with `frames` images in total."""
-    rng, replay = np.random.default_rng(0), ReplayBuffer()
+    rng = np.random.default_rng(0)
+    replay = ReplayBuffer()
     for _ in range(frames // (LENGTH + 1)):
         replay.add(
             Trajectory(

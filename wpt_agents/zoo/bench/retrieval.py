@@ -29,7 +29,10 @@ METAWORLD = (
 )
 TASK_IDS = [f"wpt/dmc-{name}-v0" for name in DMC] + [f"wpt/metaworld-{n}-v0" for n in METAWORLD]
 LOOK: dict[str, Any] = {"rendering": "fast"}
-EPISODES, STEPS, NEAREST, QUERIES = 20, 2000, 10, 10
+EPISODES = 20  # of each task
+STEPS = 2000  # updates of the world model
+NEAREST = 10  # trajectories that a query searches for
+QUERIES = 10  # for each task
 MODEL: dict[str, Any] = {"size": "tiny", "max_action_dim": 12, "batch_size": 8, "batch_length": 16}
 PAPER = 60_000, 3072  # trajectories, and the width of `paper`'s features
 
@@ -109,7 +112,9 @@ class _Blank:
     """The part of a dataset that the index uses: black first images."""
 
     def __init__(self, length: int) -> None:
-        self.length, self.embodiments, self.fingerprint = length, [None] * length, "blank"
+        self.length = length
+        self.embodiments = [None] * length
+        self.fingerprint = "blank"
         self.action_dims = np.full(length, 6)
 
     def __len__(self) -> int:
@@ -127,7 +132,8 @@ def index_cost(trajectories: int, width: int) -> dict[str, Any]:
 
 
 def _index_cost(trajectories: int, width: int) -> dict[str, Any]:
-    rng, before = np.random.default_rng(0), memory_mib("VmHWM")
+    rng = np.random.default_rng(0)
+    before = memory_mib("VmHWM")
 
     def embed(image: np.ndarray) -> np.ndarray:
         return rng.standard_normal((len(image), width), np.float32)

@@ -23,7 +23,8 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
     calls = _calls(4 if quick else LENGTH)
     for size in ("debug",) if quick else ("tiny", "small", "medium", "paper"):
         model = agent(size)
-        data, networks = synthetic_batch(*COUNTED), model.policy
+        data = synthetic_batch(*COUNTED)
+        networks = model.policy
         scale = BATCH * LENGTH / (COUNTED[0] * COUNTED[1]) / 1e3
         params = (
             count(networks.world_model),
@@ -43,7 +44,8 @@ def rows(quick: bool = False) -> Iterator[dict[str, Any]]:
 
 def _calls(length: int) -> dict[str, int]:
     """Return the operator calls without fast implementations, which is close to those on a GPU."""
-    model, data = agent("debug"), synthetic_batch(1, length)
+    model = agent("debug")
+    data = synthetic_batch(1, length)
     with definitions():
         return {
             "world model": launches(world_model_step(model, data)),

@@ -8,7 +8,6 @@ Example::
 import json
 import os
 import shutil
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -37,7 +36,7 @@ from wpt_agents.zoo.collect.episodes import (
     robot_of,
 )
 from wpt_agents.zoo.collect.policies import load_policy
-from wpt_agents.zoo.collect.state_curiosity import STAGES, write_stages
+from wpt_agents.zoo.collect.state_curiosity import STAGES, exploration_folder, write_stages
 from wpt_agents.zoo.collect.workers import worker_pool
 from wpt_agents.zoo.terminal import progress
 
@@ -45,6 +44,7 @@ NOISY = ("scripted", "policy")  # behaviours with noise of `sigmas`
 CURIOUS = (STATE_CURIOSITY, *EXPLORERS)  # behaviours with `settings`
 BEHAVIOURS = ("random", "noise", *NOISY, *CURIOUS)
 EPISODES_A_JOB = 4
+LABEL = "collect.json"  # beside the data: `Recipe.label`, tasks and episodes
 Work = TypeVar("Work")
 Result = TypeVar("Result")
 
@@ -99,7 +99,8 @@ def collect(
         seed, behaviour, dict(env or {}), rewards, tuple(sigmas), policy, dict(settings or {})
     )
     description = {"tasks": list(tasks), "episodes": episodes, **recipe.label()}
-    dataset, total = _open(Path(path), description), len(tasks) * episodes
+    dataset = _open(Path(path), description)
+    total = len(tasks) * episodes
     if dataset.appended > total:
         raise ValueError(
             f"{path} holds {dataset.appended} episodes, more than the {total} of this collection: "
@@ -107,15 +108,18 @@ def collect(
         )
     if dataset.appended == total:
         return dataset
-    label, gather = f"collect {behaviour}", _collect_played
+    gather = _collect_played
     if behaviour in EXPLORERS:
         gather = _collect_curious
     if behaviour == STATE_CURIOSITY:
         gather = _collect_state_curious
+    label = f"collect {behaviour}"
     with dataset:
         dataset.reserve()  # before counting the missing episodes
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
             gather(dataset, tasks, episodes, recipe, workers, bar)
+        for folder in dataset.path.glob("exploring-*"):
+            shutil.rmtree(folder)
     return TrajectoryDataset.open(path)
 
 
@@ -137,8 +141,6 @@ def _collect_state_curious(
     _collect_played(
         dataset, tasks, episodes, replace(recipe, stages=str(dataset.path)), workers, bar
     )
-    for folder in dataset.path.glob("exploring-*"):
-        shutil.rmtree(folder)
 
 
 def _collect_played(
@@ -176,7 +178,7 @@ def _collect_curious(
             episodes,
             recipe.seed,
             recipe.behaviour,
-            dataset.path / f"exploring-{zlib.crc32(task.encode()):08x}",
+            exploration_folder(dataset.path, task),
             partial(make_env, task, recipe),
             recipe.settings,
             robot_of(task),
@@ -194,8 +196,6 @@ def _collect_curious(
         dataset.extend(gathered.subset(range(dataset.appended % episodes, episodes)))
         dataset.flush()
     moved(len(trips) * episodes)
-    for folder in dataset.path.glob("exploring-*"):
-        shutil.rmtree(folder)
 
 
 def _done(dataset: TrajectoryDataset, at: int, episodes: int) -> int:
@@ -248,12 +248,12 @@ def _check_settings(behaviour: str, settings: Mapping[str, Any]) -> None:
 
 def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     """Return the dataset to append to: a new one, or the unfinished one of the same call."""
-    label = path / "collect.json"
+    label = path / LABEL
     dataset = TrajectoryDataset.open_or_create(path)
     if not label.exists() and dataset.appended == 0:
         with replacing(label) as temporary:
             temporary.write_text(json.dumps(description, indent=1), encoding="utf-8")
-    stored = _read_label(label) if label.exists() else {}
+    stored = read_label(path)
     differ = [key for key in {**description, **stored} if stored.get(key) != description.get(key)]
     if differ:
         raise ValueError(
@@ -263,9 +263,14 @@ def _open(path: Path, description: dict[str, Any]) -> TrajectoryDataset:
     return dataset
 
 
-def _read_label(file: Path) -> dict[str, Any]:
+def read_label(folder: Path) -> dict[str, Any]:
+    """Return how a dataset was collected, empty if its folder does not say it.
+
+    :raises ValueError: if the file is damaged
+    """
+    file = folder / LABEL
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     except ValueError as error:
         raise ValueError(
             f"{file} is damaged ({error}); restore the file, or use another path"

@@ -6,19 +6,19 @@ They are sufficient to resume exactly.
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import wait as wait_for
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from wpt_agents.agents.curious import EXPLORE, EXPLORERS, Explorer
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.workers import worker_pool
+from wpt_agents.zoo.machine import one_thread
 
 
 @dataclass(frozen=True)
@@ -40,24 +40,14 @@ class Expedition:
     rewards: bool = False
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread, so that sums have a fixed order and data depend only on the seed."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def explore(trip: Expedition) -> Iterator[int]:
     """Play the missing episodes of an expedition; yield each episode's number once stored."""
     trip.folder.mkdir(parents=True, exist_ok=True)
     store = TrajectoryDataset.open_or_create(trip.folder / "data")
     if len(store) == trip.episodes:
         return
-    with _one_thread(), store, closing(trip.make()) as env:
+    # On one thread, the data depend only on the seed.
+    with one_thread(), store, closing(trip.make()) as env:
         model = _explorer(trip, env, store)
         for trajectory in model.explore(trip.episodes):
             if len(store) < model.episodes:  # otherwise it was stored before the model
@@ -68,7 +58,8 @@ def explore(trip: Expedition) -> Iterator[int]:
 
 def _explorer(trip: Expedition, env: gym.Env, store: TrajectoryDataset) -> Explorer:
     """Return a new agent, or the one that played the stored episodes."""
-    kind, file = EXPLORERS[trip.behaviour], trip.folder / "explorer.zip"
+    kind = EXPLORERS[trip.behaviour]
+    file = trip.folder / "explorer.zip"
     if not file.exists():
         assert env.action_space.shape is not None
         keywords = {**EXPLORE, "max_action_dim": env.action_space.shape[0], **trip.settings}

@@ -67,8 +67,9 @@ class Recipe:
     stages: str | None = None
 
     def label(self) -> dict[str, Any]:
-        """Return the content of `collect.json`: seed, behaviour, env, and non-default settings."""
-        always, default = ("seed", "behaviour", "env"), vars(Recipe())
+        """Return a part of `collect.json`: seed, behaviour, env, and non-default settings."""
+        always = "seed", "behaviour", "env"
+        default = vars(Recipe())
         changed = {k: v for k, v in vars(self).items() if k in always or v != default[k]}
         return json.loads(json.dumps(changed))
 
@@ -96,10 +97,13 @@ def play(job: Job) -> list[Trajectory]:
 
 def make_env(task: str, recipe: Recipe) -> gym.Env:
     """Make the task with actions in [-1, 1], and with the state in `info` if it is needed."""
-    needs_state = recipe.behaviour == "scripted" and has_script(task)
-    needs_state = needs_state or (recipe.policy is not None and sees_states(recipe.policy))
-    needs_state = needs_state or recipe.stages is not None
-    env = gym.make(task, **{**recipe.env, **({"state_in_info": True} if needs_state else {})})
+    needs_state = (
+        (recipe.behaviour == "scripted" and has_script(task))
+        or (recipe.policy is not None and sees_states(recipe.policy))
+        or recipe.stages is not None
+    )
+    keywords = {**recipe.env, "state_in_info": True} if needs_state else recipe.env
+    env = gym.make(task, **keywords)
     check_actions(env.action_space, max_action_dim=None)
     if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))

@@ -56,7 +56,9 @@ class SavedPolicy:
     """
 
     def __init__(self, rng: np.random.Generator, name: str, sigma: float, width: int) -> None:
-        self.rng, self.model, self.sigma = rng, load_policy(name), sigma
+        self.rng = rng
+        self.model = load_policy(name)
+        self.sigma = sigma
         self.sees_states = sees_states(name)
         self.state: tuple[np.ndarray, ...] | None = None
         if self.model.action_space.shape != (width,):

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 
 from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.collect.behaviours import Act
+from wpt_agents.zoo.machine import one_thread
 
 STEPS = 100_000  # calls of `env.step` in an exploration
 STAGES = 5  # number of policies to keep, evenly spaced
@@ -181,10 +182,15 @@ def explore_states(
     return kept
 
 
-def stage_files(folder: Path, task: str) -> list[Path]:
-    """Return the folder of the stages of a task's exploration."""
-    name = f"exploring-{zlib.crc32(task.encode()):08x}"
-    return [folder / name / f"stage-{stage}.pt" for stage in range(STAGES)]
+def exploration_folder(dataset: Path, task: str) -> Path:
+    """Return the folder for the exploration of a task, below that of the dataset."""
+    return dataset / f"exploring-{zlib.crc32(task.encode()):08x}"
+
+
+def stage_files(dataset: Path, task: str) -> list[Path]:
+    """Return the files of the stages of a task's exploration."""
+    folder = exploration_folder(dataset, task)
+    return [folder / f"stage-{stage}.pt" for stage in range(STAGES)]
 
 
 def write_stages(
@@ -195,12 +201,8 @@ def write_stages(
     if files[-1].exists():  # written last
         return
     files[0].parent.mkdir(parents=True, exist_ok=True)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums in a fixed order, so that the data depend only on the seed
-    try:
+    with one_thread():  # so that the data depend only on the seed
         stages = explore_states(task, env, seed=seed, **settings)
-    finally:
-        torch.set_num_threads(threads)
     for file, weights in zip(files, stages, strict=True):
         with replacing(file) as temporary:
             temporary.write_bytes(weights)

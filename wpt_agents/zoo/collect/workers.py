@@ -8,7 +8,7 @@ from multiprocessing import get_context, parent_process
 
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
-    """Return a context for new processes, which do not inherit any state."""
+    """Return a pool of new processes, which do not inherit any state."""
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
 
 

@@ -100,7 +100,7 @@ Robots = Annotated[
 def bench(
     case: CaseOption = Case.all,
     as_json: AsJson = False,
-    quick: Quick = (False),
+    quick: Quick = False,
     threads: Threads = 1,
     precision: PrecisionOption = Precision.fp32,
     compiled: Compiled = False,

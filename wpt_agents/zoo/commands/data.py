@@ -1,4 +1,4 @@
-"""The commands that make and show data: collect, import, data ..., retrieve show.
+"""The commands that make and show data: collect, import, data ..., retrieve ...
 
 Imports are inside the commands so that `--help` answers at once.
 """

@@ -1,6 +1,5 @@
 """The command `report`. Imports are inside it so that `--help` answers at once."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -61,6 +60,7 @@ def report(
     from wpt_agents.zoo.report.steadiness import markdown as steadiness_markdown
     from wpt_agents.zoo.report.steadiness import steadiness
     from wpt_agents.zoo.terminal import console
+    from wpt_agents.zoo.text_files import write_text
 
     if record is not None:
         record_page.check(record)
@@ -68,11 +68,11 @@ def report(
     runs = find_finished(folder)
     results = [run.result for run in runs]
     sequences = figures_4(find_sequences(folder))
-    kept = records.read(record) if not results and record is not None and record.exists() else []
-    if record is not None and kept:
+    if not results and record is not None and record.exists() and records.read(record):
         record_page.renew(record)
-        kept_as = f"No finished run below {folder}: {record} stays, its pages are renewed."
-        console.print(kept_as, markup=False)
+        console.print(
+            f"No finished run below {folder}: {record} stays, its pages are renewed.", markup=False
+        )
         if not sequences:
             return
     if not results and not sequences:
@@ -92,7 +92,8 @@ def report(
     else:
         page = (out or folder / "report") / "index.html"
         write_page(folder, page, media, runs)
-        _write_beside(page, {"report.md": as_markdown, "policies.csv": tables.policy_csv(policies)})
+        write_text(page.with_name("report.md"), as_markdown)
+        write_text(page.with_name("policies.csv"), tables.policy_csv(policies))
         if rows:
             console.print(tables.summary_table(rows))
         if sequences:
@@ -101,12 +102,3 @@ def report(
             console.print(missing, markup=False)
         where = escape(str(page.resolve()))
         console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")
-
-
-def _write_beside(page: Path, texts: Mapping[str, str]) -> None:
-    """Write files into the folder of the page atomically."""
-    from wpt_agents.files.archive import replacing
-
-    for name, text in texts.items():
-        with replacing(page.with_name(name)) as temporary:
-            temporary.write_text(text, encoding="utf-8")

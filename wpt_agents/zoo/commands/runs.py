@@ -233,7 +233,7 @@ def run_benchmark(
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.runs import make_plan
-    from wpt_agents.zoo.plan.sequences import make_sequences
+    from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
     from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
@@ -242,10 +242,19 @@ def run_benchmark(
     if started_by_torchrun():
         raise ValueError("torchrun is for `pretrain`: pre-train with it, then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
-    if from_nothing and load_preset(suite, preset).pretrain.model:
+    preset_suite = find_sequence(sequence).suite if sequence else suite
+    if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
-    limits = cpus, gpus, memory_gb, hours, retries
-    resources = Resources(workers, *limits, address, partition)
+    resources = Resources(
+        workers=workers,
+        cpus=cpus,
+        gpus=gpus,
+        memory_gb=memory_gb,
+        hours=hours,
+        retries=retries,
+        address=address,
+        partition=partition,
+    )
     check_resources(engine, resources)
     if record is not None:
         if sequence or watch:
@@ -254,8 +263,7 @@ def run_benchmark(
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
-        where = out, workers, device, data
-        jobs = make_sequences(sequence, preset, seeds, method, changes, *where)
+        jobs = make_sequences(sequence, preset, seeds, method, changes, out, workers, device, data)
         if not do_sequences(jobs, force, dry_run):
             raise typer.Exit(1)
         return

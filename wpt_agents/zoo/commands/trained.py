@@ -1,4 +1,4 @@
-"""The commands for a trained model: eval, enjoy, diagnose, open-loop, push, pull."""
+"""The commands for a trained model: eval, enjoy, diagnose, open-loop, probe, push, pull."""
 
 from pathlib import Path
 from typing import Annotated
@@ -251,7 +251,7 @@ def pull_run(
     ],
     out: Annotated[
         Path | None, typer.Option(help="The folder to write; by default the repository's name.")
-    ] = (None),
+    ] = None,
 ) -> None:
     """Download a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`.
 

@@ -60,28 +60,28 @@ def promises(
     :param starts: steps, each at least `horizon` before the end
     """
     assert trajectory.reward is not None
-    width, model = policy.max_action_dim, policy.world_model
+    model = policy.world_model
     generator = Generator(policy.device).manual_seed(0)
-    batch = stack_windows([led_to(trajectory, 0, len(trajectory) + 1, width)]).to(policy.device)
+    whole = led_to(trajectory, 0, len(trajectory) + 1, policy.max_action_dim)
+    batch = stack_windows([whole]).to(policy.device)
     post, _, _ = model.observe(batch, generator)
-    value, rows = policy.critic.value(post.feat)[0], []
+    value = policy.critic.value(post.feat)[0]
+    rows = []
     for start in starts:
         state = Latent(*(x[:, start].repeat_interleave(SAMPLES, 0) for x in post))
         taken = batch.action[:, start + 1 : start + 1 + horizon].expand(SAMPLES, -1, -1)
         same, _ = model.rssm.imagine(state, partial(_taken, taken), horizon, generator)
         replanned, _ = model.rssm.imagine(state, lambda s, _: _mode(policy, s), horizon, generator)
-        same_actions, own_actions = (
-            float(model.reward(dream.feat)[:, 1:].mean()) for dream in (same, replanned)
-        )
-        arriving, rest = float(batch.reward[0, start]), trajectory.reward[start:]
+        arriving = float(batch.reward[0, start])
+        rest = trajectory.reward[start:]
         rows.append(
             Promise(
-                start,
-                float(rest[:horizon].mean()),
-                same_actions,
-                own_actions,
-                float(value[start]),
-                arriving + float(rest @ gamma ** np.arange(1, len(rest) + 1)),
+                start=start,
+                earned=float(rest[:horizon].mean()),
+                same_actions=float(model.reward(same.feat)[:, 1:].mean()),
+                own_actions=float(model.reward(replanned.feat)[:, 1:].mean()),
+                value=float(value[start]),
+                discounted=arriving + float(rest @ gamma ** np.arange(1, len(rest) + 1)),
             )
         )
     return rows
@@ -117,7 +117,7 @@ def diagnose(
 ) -> Diagnosis:
     """Play episodes with a trained model and compare its predictions with actual rewards.
 
-    :raises ValueError: if an episode is not longer than `horizon`
+    :raises ValueError: if the model is not WPT's, or if an episode is shorter than `horizon`
     """
     model = trained.load(device=device)
     if not isinstance(model, WPT):

@@ -104,7 +104,7 @@ def find_trained(path: Path, task: str = "") -> Trained:
     if not path.exists():
         raise FileNotFoundError(f"There is no {path}; name a run folder or a model file (.zip)")
     folder = path if path.is_dir() else path.parent
-    model = best_model(path) if path.is_dir() else path
+    model = final_model(path) if path.is_dir() else path
     origin = read_origin(folder)
     if origin is None and not task:
         raise ValueError(f"{folder} has no config.yaml to say what {model.name} is for: add --task")
@@ -118,7 +118,7 @@ def find_trained(path: Path, task: str = "") -> Trained:
     return Trained(model, name, origin.env, find_method(origin.method))
 
 
-def best_model(folder: Path) -> Path:
+def final_model(folder: Path) -> Path:
     """Return the model file of the run's score: the best agent if it was kept, else the last."""
     for name in ("best_model.zip", "model.zip"):
         if (folder / name).exists():
@@ -130,7 +130,7 @@ def best_model(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Origin:
-    """Return the task, environment and method of the model in a run folder."""
+    """The task, environment and method of the model in a run folder."""
 
     task: str
     env: Mapping[str, Any] = field(default_factory=dict)

@@ -7,9 +7,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from wpt_agents.zoo.result import NOTHING, RANDOM
+
 Observation = np.ndarray | dict[str, np.ndarray]
-
-
 State = tuple[np.ndarray, ...]
 
 
@@ -34,7 +34,8 @@ class RandomPolicy:
     """A policy with uniform actions in the action space."""
 
     def __init__(self, action_space: spaces.Box, seed: int) -> None:
-        self.action_space, self.rng = action_space, np.random.default_rng(seed)
+        self.action_space = action_space
+        self.rng = np.random.default_rng(seed)
 
     def predict(
         self,
@@ -49,6 +50,6 @@ class RandomPolicy:
 
 
 BASELINES: Mapping[str, Callable[[spaces.Box, int], PolicyPredictor]] = {
-    "nothing": lambda space, seed: DoNothing(space),
-    "random": RandomPolicy,
+    NOTHING: lambda space, seed: DoNothing(space),
+    RANDOM: RandomPolicy,
 }

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from wpt_agents.zoo.pictures.runs import INK
+from wpt_agents.zoo.pictures.style import INK
 
 SHOTS = 50  # maximum number of frames in a GIF, of 10 to 25 kB each
 SLOWDOWN = 2  # half speed, because episodes of Meta-World last only 2.5 seconds

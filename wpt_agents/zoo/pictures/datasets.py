@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.pictures.runs import INK, MUTED, plt
 from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, short
+from wpt_agents.zoo.pictures.style import INK, MUTED, plt
 
 
 def data_table(dataset: TrajectoryDataset) -> Table:

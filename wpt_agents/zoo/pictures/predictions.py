@@ -5,16 +5,13 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
-INK, MUTED = "#1f2933", "#8a94a0"
+from wpt_agents.zoo.pictures.style import INK, MUTED, plt
+
 # Okabe and Ito's colour-blind safe colours; dashes help in print
 STYLES: dict[str, dict[str, Any]] = {
     "world model": {"color": "#0072b2", "lw": 2.4},

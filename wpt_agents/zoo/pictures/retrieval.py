@@ -12,8 +12,8 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.zoo.pictures.runs import AGENT, CLONE, INK, plt
 from wpt_agents.zoo.pictures.sheets import COLUMNS, cut, draw, finish, kind
+from wpt_agents.zoo.pictures.style import AGENT, CLONE, INK, plt
 from wpt_agents.zoo.vec_envs import make_vec_env
 
 

@@ -6,20 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from wpt_agents.zoo.pictures.predictions import ahead
+from wpt_agents.zoo.pictures.style import AGENT, CLONE, INK, MUTED, plt
 from wpt_agents.zoo.result import LAST, NOTHING, PRIOR_ACTOR, RANDOM, Score, final_policy
 
-INK = "#1f2933"
-MUTED = "#8a94a0"
-AGENT = "#2463a8"  # the colour of the agent, and of the query's own robot
-CLONE = "#d98324"  # the colour of the prior actor, and of other robots
 COLOURS = {NOTHING: "#b0b7bf", RANDOM: "#7f8a96", PRIOR_ACTOR: CLONE}
 
 

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-from wpt_agents.zoo.pictures.runs import INK, MUTED, plt
+from wpt_agents.zoo.pictures.style import INK, MUTED, plt
 
 COLUMNS = 8  # images per row of the contact sheet, and of a run's retrieval sheet
 

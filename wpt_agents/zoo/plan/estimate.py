@@ -11,6 +11,7 @@ from wpt_agents.model.sizes import SIZES, Size, find_size
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.results import read_results
+from wpt_agents.zoo.sequence_result import read_row
 
 STORED_STEP = 2_500  # bytes of an image in the dataset, which uses lossless compression
 RAW_STEP = 12_288  # bytes of an image in the replay
@@ -21,15 +22,19 @@ WIDTHS = ("deter", "hidden", "stoch", "classes", "depth", "units")  # fields of 
 WEIGHT = 12  # bytes per parameter in a model file: its value and the optimiser's two averages
 
 
+def is_finished(job: Run) -> bool:
+    """Return whether a run, or a task of a sequence, has its scores."""
+    return read_result(job.folder) is not None or read_row(job.folder) is not None
+
+
 def disk_needed(jobs: Sequence[Run]) -> int:
     """Return the bytes that the unfinished runs will write, the dataset included."""
-    left = [job for job in jobs if read_result(job.folder) is None]
+    left = [job for job in jobs if not is_finished(job)]
     data = {job.shared.data_path: job.shared for job in left if job.algorithm.needs_data}
     total = 0
     for shared in data.values():
-        missing = 0 if shared.given_data is not None else shared.episodes - shared.stored
         steps = 1000 // shared.preset.env.action_repeat  # assumes the longest episodes
-        total += max(missing, 0) * steps * STORED_STEP
+        total += shared.missing * steps * STORED_STEP
     models = [model_bytes(job) for job in left]
     replay = max((job.preset.steps * RAW_STEP for job in left), default=0)
     checkpoints = 2 * max(models, default=0)  # only the current run has them
@@ -91,7 +96,7 @@ def gigabytes(size: int) -> str:
 
 def summary(jobs: Sequence[Run], force: bool = False) -> str:
     """Summarise a plan in one line; with `force`, finished runs are repeated."""
-    left = [job for job in jobs if force or read_result(job.folder) is None]
+    left = [job for job in jobs if force or not is_finished(job)]
     hours = hours_needed(left, jobs[0])
     time = (
         "time unknown until one of this preset is finished"

@@ -6,10 +6,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.files.names import counted
+from wpt_agents.zoo.plan.estimate import is_finished
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.record_lines import Identity, read
-from wpt_agents.zoo.result import read_result
-from wpt_agents.zoo.sequence_result import read_row
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import console, dim
 
@@ -27,8 +26,7 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
     lines = read(record) if record is not None and record.exists() else []
     recorded = {line.run for line in lines} & set(map(identity_of, jobs))
     for job in jobs:
-        done = read_result(job.folder) or read_row(job.folder)
-        state = "finished" if done and not force else "to do"
+        state = "finished" if is_finished(job) and not force else "to do"
         if identity_of(job) in recorded:
             state += ", recorded"
         updates = "-" if job.updates is None else f"{job.updates:,}"
@@ -39,8 +37,8 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
         console.print(f"record       has {len(recorded)} of {len(jobs)} runs  {dim(record)}")
     datasets = {job.shared.data_path: job.shared for job in jobs if job.algorithm.needs_data}
     for path, shared in datasets.items():
-        missing = 0 if shared.given_data is not None else shared.episodes - shared.stored
-        state = f"{counted(missing, 'episode')} to collect" if missing > 0 else "exists"
+        missing = shared.missing
+        state = f"{counted(missing, 'episode')} to collect" if missing else "exists"
         console.print(f"dataset      {state}  {dim(path)}")
     models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
     for path, shared in models.items():

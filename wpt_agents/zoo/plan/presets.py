@@ -232,7 +232,7 @@ def preset_names(suite: str) -> list[str]:
 
 
 class SuiteFile(NamedTuple):
-    """Return the content of zoo/<suite>.yaml."""
+    """The content of zoo/<suite>.yaml."""
 
     default: Mapping[str, Any]
     presets: Mapping[str, Any]

@@ -39,7 +39,7 @@ def this_command() -> str:
 class Run:
     """One run: a task, a method and a seed with the settings of a preset.
 
-    :param changes: of the preset, sorted by key
+    :param changes: of the preset, without those that a later one overrules
     :param data: the user's own dataset, None for the preset's
     :param data_name: `data` as the user wrote it; `data` itself may be absolute
     :param command: the user's command, regardless of the process that executes the run

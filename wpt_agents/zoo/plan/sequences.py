@@ -104,9 +104,12 @@ def make_sequences(
                 f"{', '.join(able_methods())}"
             )
     changes = [*sequence.changes(preset), {"packnet": {"tasks": len(sequence.tasks)}}]
-    where = out, workers, device, data
-    suite, tasks = sequence.suite, sequence.tasks
-    runs = make_plan(suite, tasks, preset, seeds, methods, settings, *where, changes)
+    runs = make_plan(
+        *(sequence.suite, sequence.tasks, preset, seeds, methods, settings, out, workers),
+        device=device,
+        data=data,
+        sections=changes,
+    )
     groups: dict[tuple[str, int], list[Run]] = {}
     for run in runs:
         groups.setdefault((run.method, run.seed), []).append(replace(run, sequence=name))

@@ -94,6 +94,11 @@ class Shared:
             return 0
 
     @property
+    def missing(self) -> int:
+        """The number of episodes that are still to be collected."""
+        return 0 if self.given_data is not None else max(self.episodes - self.stored, 0)
+
+    @property
     def shipped(self) -> str:
         """The model of the library that replaces pre-training, or ""."""
         return shipped_for(self.preset, self.agent)

@@ -23,6 +23,7 @@ from wpt_agents.zoo.statistics import (
     resamplable,
 )
 
+PAPER_BUDGET = 150_000  # simulator frames
 BEST_RETURN = 1000.0  # maximum return of a DMControl episode; success rates are already normalised
 STATISTICS = {"mean": mean, "median": median, "IQM": iqm, "optimality gap": optimality_gap}
 Estimate = tuple[float, float | None, float | None]  # value, and its 95 % interval if there is one
@@ -96,6 +97,17 @@ def paper_tasks(suite: str, method: str = "") -> set[str]:
     }
 
 
+def printed_scores(suite: str, method: str, samples: int) -> dict[str, float]:
+    """Return the paper's scores of a method by task, in the units of its tables."""
+    return {
+        row.task: row.score
+        for row in references()
+        if (row.suite, row.method, row.samples) == (suite, method, samples)
+        and row.task not in STATISTICS
+        and row.score is not None
+    }
+
+
 def normalised(score: float, metric: str) -> float:
     """Return a score normalised to a maximum of 1."""
     return score if metric == "success" else score / BEST_RETURN
@@ -161,13 +173,8 @@ def paper_aggregate(
     """Return the paper's mean and median over these tasks, None if it has no score for any."""
     names = set(tasks)
     best = BEST_RETURN if suite == "dmc" else 1.0
-    scores = [
-        row.score / best
-        for row in references()
-        if (row.suite, row.method, row.samples) == (suite, method, samples)
-        and row.task in names
-        and row.score is not None
-    ]
+    printed = printed_scores(suite, method, samples)
+    scores = [score / best for task, score in printed.items() if task in names]
     if not scores:
         return None
     return Aggregate(float(np.mean(scores)), float(np.median(scores)), len(scores))
@@ -175,15 +182,9 @@ def paper_aggregate(
 
 def misprint(row: Reference) -> float | None:
     """Return the correct mean or median of the rows above, if the printed one differs."""
-    if row.task not in ("mean", "median") or row.score is None:
+    if row.task not in STATISTICS or row.score is None:
         return None
-    scores = [
-        other.score
-        for other in references()
-        if (other.suite, other.method, other.samples) == (row.suite, row.method, row.samples)
-        and other.task not in ("mean", "median")
-        and other.score is not None
-    ]
+    scores = list(printed_scores(row.suite, row.method, row.samples).values())
     right = float(np.mean(scores) if row.task == "mean" else np.median(scores))
     rounding = 0.006 if row.suite == "dmc" else 0.0006  # half a unit of the last printed digit
     return None if abs(right - row.score) <= rounding else right

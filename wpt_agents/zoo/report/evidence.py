@@ -12,8 +12,8 @@ import numpy as np
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.numbers import interval_text, number
 from wpt_agents.zoo.record_lines import Line
-from wpt_agents.zoo.report.aggregates import STATISTICS, normalised, references
-from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, normalised, printed_scores
+from wpt_agents.zoo.report.headline import SUITES
 from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
 from wpt_agents.zoo.report.tables import markdown_table
@@ -106,12 +106,13 @@ def _by_column(line: Line) -> tuple[str, int, str, int]:
 def paper_scores(suite: str) -> dict[str, dict[str, float]]:
     """Return the paper's scores at 150,000 frames by method and task, 0 to 100."""
     metric = "return" if suite == "dmc" else "success"
-    scores: dict[str, dict[str, float]] = {method: {} for method in PAPER}
-    for row in references():
-        counts = (row.suite, row.samples) == (suite, PAPER_BUDGET) and row.task not in STATISTICS
-        if counts and row.method in PAPER and row.score is not None:
-            scores[row.method][row.task] = 100 * normalised(row.score, metric)
-    return scores
+    return {
+        method: {
+            task: 100 * normalised(score, metric)
+            for task, score in printed_scores(suite, method, PAPER_BUDGET).items()
+        }
+        for method in PAPER
+    }
 
 
 def markdown(lines: Sequence[Line]) -> str:

@@ -21,7 +21,7 @@ from wpt_agents.zoo.sequence_result import FILE, SequenceResult, read_sequence
 
 COMPARED = ("wpt", "packnet")
 WINDOW = 10  # training episodes per point of a curve, if there are no evaluations
-Finished = tuple[Path, SequenceResult]
+SequenceFolder = tuple[Path, SequenceResult]  # of a sequence with a finished task
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Figure4:
         return [matrix.name for matrix in self.matrices]
 
 
-def find_sequences(folder: Path) -> list[Finished]:
+def find_sequences(folder: Path) -> list[SequenceFolder]:
     """Return every sequence below `folder` with a finished task, in the order of their paths.
 
     :raises ValueError: if a sequence exists twice, which would count as two seeds
@@ -74,9 +74,9 @@ def find_sequences(folder: Path) -> list[Finished]:
     return finished
 
 
-def figures_4(finished: Sequence[Finished]) -> list[Figure4]:
+def figures_4(finished: Sequence[SequenceFolder]) -> list[Figure4]:
     """Return a figure for each sequence, preset and budget, from the existing runs."""
-    groups: dict[tuple[str, str, int], list[Finished]] = defaultdict(list)
+    groups: dict[tuple[str, str, int], list[SequenceFolder]] = defaultdict(list)
     for path, result in finished:
         key = result.sequence, str(result.variant), result.frames
         groups[key].append((path, result))
@@ -113,8 +113,10 @@ def sequence_table(figures: Sequence[Figure4]) -> Table:
     return table
 
 
-def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finished]) -> Figure4:
-    methods: dict[str, list[Finished]] = defaultdict(list)
+def _figure(
+    sequence: str, variant: str, frames: int, finished: Sequence[SequenceFolder]
+) -> Figure4:
+    methods: dict[str, list[SequenceFolder]] = defaultdict(list)
     for path, result in finished:
         methods[result.method].append((path, result))
     tasks = list(finished[0][1].tasks)
@@ -140,7 +142,7 @@ def _figure(sequence: str, variant: str, frames: int, finished: Sequence[Finishe
     )
 
 
-def _missing(finished: Sequence[Finished]) -> list[str]:
+def _missing(finished: Sequence[SequenceFolder]) -> list[str]:
     """Return a line for each unfinished sequence with its number of tasks."""
     lines = []
     for _, result in finished:
@@ -149,7 +151,7 @@ def _missing(finished: Sequence[Finished]) -> list[str]:
     return lines
 
 
-def _share(runs: Sequence[Finished], ours: Sequence[Finished]) -> float | None:
+def _share(runs: Sequence[SequenceFolder], ours: Sequence[SequenceFolder]) -> float | None:
     """Return the mean return during learning as a share of WPT's, on common tasks."""
     if not ours:
         return None
@@ -161,7 +163,7 @@ def _share(runs: Sequence[Finished], ours: Sequence[Finished]) -> float | None:
     return float(theirs / wpt) if wpt else None
 
 
-def _matrix(name: str, finished: Sequence[Finished], share: float | None) -> Matrix:
+def _matrix(name: str, finished: Sequence[SequenceFolder], share: float | None) -> Matrix:
     results = [result for _, result in finished]
     tasks = results[0].tasks
     rows = [
@@ -171,7 +173,7 @@ def _matrix(name: str, finished: Sequence[Finished], share: float | None) -> Mat
     return Matrix(name, [result.seed for result in results], rows, results[0].command, share)
 
 
-def _curves(runs: Sequence[Finished], task: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def _curves(runs: Sequence[SequenceFolder], task: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the curves of a task, without those whose file is damaged."""
     curves = [unless_damaged(partial(_curve, result, task), path) for path, result in runs]
     return [one for one in curves if one is not None]

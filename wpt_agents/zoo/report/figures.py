@@ -8,11 +8,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from wpt_agents.zoo.pictures.style import plt
 
 # Placeholder colours, which `svg` replaces with the page's CSS variables.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wpt_agents.zoo.report import aggregates
-from wpt_agents.zoo.report.aggregates import Experiment
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, Experiment
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.result import PRIOR_ACTOR, RANDOM, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
@@ -19,7 +19,6 @@ COMPARED = {  # a policy's label on the page, and its `policy_name`
     "prior actor": PRIOR_ACTOR,
     "same, from scratch": "scratch",
 }
-PAPER_BUDGET = 150_000  # simulator frames
 
 Policies = dict[str, dict[int, float]]  # name -> seed -> score
 

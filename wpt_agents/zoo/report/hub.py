@@ -101,7 +101,7 @@ An agent of [wpt_agents](https://arxiv.org/abs/2502.19544), preset `{result.vari
 seed {result.seed}, after {result.frames:,} simulator frames of `{result.task}`.
 
 {table}
-Commit {result.commit}. Made by:
+Commit {result.commit_name}. Made by:
 
 ```bash
 {result.command}

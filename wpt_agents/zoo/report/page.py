@@ -8,7 +8,6 @@ from pathlib import Path
 import jinja2
 import yaml
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.files.names import counted, unknown_name
 from wpt_agents.zoo import numbers
 from wpt_agents.zoo.report import (
@@ -25,6 +24,7 @@ from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, f
 from wpt_agents.zoo.report.names import MEANINGS, policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
 from wpt_agents.zoo.result import Result, Score, Variant
+from wpt_agents.zoo.text_files import write_text
 
 MEDIA = ("first", "all", "none")
 
@@ -47,16 +47,14 @@ def write_page(
     check_media(media)
     sequences = figure4.find_sequences(folder)
     runs = find_finished(folder) if runs is None else runs
-    page = render(runs, find_unfinished(folder), media, sequences)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, render(runs, find_unfinished(folder), media, sequences))
 
 
 def render(
     runs: Sequence[Finished],
     unfinished: Sequence[Unfinished],
     media: str = "first",
-    sequences: Sequence[figure4.Finished] = (),
+    sequences: Sequence[figure4.SequenceFolder] = (),
 ) -> str:
     """Return the page's HTML."""
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
@@ -99,7 +97,7 @@ def render(
         both=headline.both_suites(results),
         commits=sorted({result.commit_name for result in results}),
         seeds=sorted({result.seed for result in results}),
-        paper_budget=headline.PAPER_BUDGET,
+        paper_budget=aggregates.PAPER_BUDGET,
     )
 
 

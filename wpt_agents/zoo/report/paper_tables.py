@@ -8,9 +8,8 @@ import numpy as np
 
 from wpt_agents.zoo.numbers import POSSIBLE, evidence_text, seeds_text
 from wpt_agents.zoo.report import aggregates
-from wpt_agents.zoo.report.aggregates import STATISTICS, Reference
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, STATISTICS, Reference
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.headline import PAPER_BUDGET
 from wpt_agents.zoo.report.sections import BASELINES, Names
 from wpt_agents.zoo.statistics import mean_interval
 

@@ -5,20 +5,17 @@ longer exist are kept, and lines of the same run are replaced, also those of pol
 longer has.
 """
 
-import csv
-import io
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
 from pathlib import Path
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.record_lines import COLUMNS, Line, read
+from wpt_agents.zoo.record_lines import Line, csv_of, read
 from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.result import UNTRAINED, Result
+from wpt_agents.zoo.text_files import write_text
 
 KNOWN = (  # of methods in tables: the simplest first, then the paper's ablation, then ours
     *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
@@ -85,13 +82,7 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
     before = [line for line in known if line.agent not in again]
     warn_of_replaced(path, known, lines)
     every = sorted({line.run: line for line in [*before, *lines]}.values(), key=order)
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    names = [field.name for field in fields(Line)]
-    writer.writerows([getattr(line, name) for name in names] for line in every)
-    with replacing(path) as temporary:
-        temporary.write_text(file.getvalue(), encoding="utf-8")
+    write_text(path, csv_of(Line, every))
     return every
 
 

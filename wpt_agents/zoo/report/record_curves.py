@@ -5,29 +5,33 @@ the table keeps them.
 """
 
 import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.record_lines import Identity, Line
+from wpt_agents.zoo.pictures.style import plt
+from wpt_agents.zoo.record_lines import Identity, Line, csv_of
 from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.evidence import Evidence, evidence
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.record import place
-from wpt_agents.zoo.report.record_picture import PAPER_NAME, STYLES, Style, least, styles_of
+from wpt_agents.zoo.report.record_picture import (
+    PAPER_NAME,
+    STYLES,
+    Style,
+    least,
+    legend_of,
+    save,
+    styles_of,
+)
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
+from wpt_agents.zoo.text_files import write_text
 
 COLUMNS = 5  # panels in a row
 
@@ -76,19 +80,12 @@ def points_of(runs: Iterable[Finished]) -> Iterator[Point]:
 
 def update(record: Path, points: Iterable[Point]) -> list[Point]:
     """Add points to the curves of a record, in place of those of the same runs; return all."""
-    path = place_of(record)
     points = list(points)
     again = {point.run for point in points}
     before = [point for point in read(record) if point.run not in again]
     every = sorted([*before, *points], key=lambda p: (p.suite, *p.run, p.at))
     if every:
-        names = [field.name for field in fields(Point)]
-        file = io.StringIO()
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([getattr(point, name) for name in names] for point in every)
-        with replacing(path) as temporary:
-            temporary.write_text(file.getvalue(), encoding="utf-8")
+        write_text(place_of(record), csv_of(Point, every))
     return every
 
 
@@ -141,9 +138,7 @@ def draw(record: Path, points: Sequence[Point], lines: Sequence[Line]) -> None:
     for panel in axes.flat[len(panels) :]:
         panel.remove()
     _legend(figure)
-    with replacing(place_of(record).with_suffix(".png")) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
+    save(figure, place_of(record).with_suffix(".png"))
 
 
 Curves = dict[str, dict[int, list[float]]]  # method -> frames -> the score of each seed
@@ -188,11 +183,7 @@ def _draw_panel(
 
 
 def _legend(figure: Figure) -> None:
-    labels = {
-        label: handle
-        for panel in figure.axes
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-    }
+    labels = legend_of(figure)
     figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=4, fontsize=8)
     figure.supxlabel("thousand frames", fontsize=8)
     figure.supylabel("score, 0 to 100", fontsize=8)

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from wpt_agents.files.archive import replacing
 from wpt_agents.zoo.locks import locked_folder
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report import evidence, pairs, record_curves, record_picture, record_tables
 from wpt_agents.zoo.report import record as records
 from wpt_agents.zoo.report.folders import Finished
+from wpt_agents.zoo.text_files import write_text
 
 INTRODUCTION = """\
 # Recorded scores
@@ -53,8 +53,7 @@ def renew(record: Path) -> None:
 
 def write(record: Path, lines: Sequence[Line]) -> None:
     """Write the tables and the pictures of a record beside it."""
-    with replacing(record.with_suffix(".md")) as temporary:
-        temporary.write_text(markdown(lines), encoding="utf-8")
+    write_text(record.with_suffix(".md"), markdown(lines))
     record_picture.draw(record.with_suffix(".png"), lines)
     record_curves.draw(record, record_curves.read(record), lines)
 

@@ -5,24 +5,22 @@ marker. The colours are Okabe and Ito's colour-blind safe ones.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
-
-from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.record_lines import Line
-from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
-from wpt_agents.zoo.report.headline import PAPER_BUDGET, SUITES
-from wpt_agents.zoo.report.record_tables import Key, by_task
-
-matplotlib.use("Agg")  # no display
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from wpt_agents.files.archive import replacing
+from wpt_agents.zoo.pictures.style import plt
+from wpt_agents.zoo.record_lines import Line
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET
+from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
+from wpt_agents.zoo.report.headline import SUITES
+from wpt_agents.zoo.report.record_tables import Cell, Key, by_task
 
 PANELS = 8  # up to this number of tasks each has a panel
 
@@ -68,9 +66,23 @@ def draw(path: Path, lines: Sequence[Line]) -> None:
     usual = usual_lines(lines)
     many = len({line.task for line in usual}) > PANELS
     figure = draw_rows(evidence(usual)) if many else draw_panels(usual or lines)
+    save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure atomically, and close it."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     plt.close(figure)
+
+
+def legend_of(figure: Figure) -> dict[str, Any]:
+    """Return what a legend of all panels shows: each label once, with its line or marker."""
+    return {
+        label: handle
+        for panel in figure.axes
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
 
 
 def draw_rows(suites: Sequence[Evidence]) -> Figure:
@@ -87,11 +99,7 @@ def draw_rows(suites: Sequence[Evidence]) -> Figure:
     styles = styles_of(names)
     for panel, one in zip(axes.flat, suites, strict=True):
         _draw_suite(panel, one, styles)
-    legend = {
-        label: handle
-        for panel in axes.flat
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-    }
+    legend = legend_of(figure)
     figure.legend(
         legend.values(), legend.keys(), loc="outside upper center", ncols=min(4, len(legend))
     )
@@ -139,7 +147,7 @@ def _draw_suite(panel: Axes, one: Evidence, styles: dict[str, Style]) -> None:
 
 def draw_panels(lines: Sequence[Line]) -> Figure:
     """Draw a panel for each task: the seeds of each method as dots, their mean as a stroke."""
-    tasks = {name: panel_rows(*name, lines) for name in by_task(lines)}
+    tasks = {name: panel_rows(*name, cells) for name, cells in by_task(lines).items()}
     columns = min(4, len(tasks))
     lengths = [sum(row.height for row in rows) for rows in tasks.values()]
     heights = [max(lengths[i : i + columns]) for i in range(0, len(lengths), columns)]
@@ -161,10 +169,7 @@ def draw_panels(lines: Sequence[Line]) -> Figure:
 
 
 class PanelRow(NamedTuple):
-    """A method's scores in a panel.
-
-    :param height: in lines of text, those of the label and half a line between rows
-    """
+    """A method's scores in a panel."""
 
     label: str
     scores: Sequence[float]
@@ -172,20 +177,16 @@ class PanelRow(NamedTuple):
 
     @property
     def height(self) -> float:
-        """The number of lines that the row takes."""
+        """The lines of text that the row takes: those of its label, half a line between rows."""
         return self.label.count("\n") + 1.5
 
 
-def panel_rows(suite: str, task: str, lines: Sequence[Line]) -> list[PanelRow]:
+def panel_rows(suite: str, task: str, cells: Mapping[Key, Cell]) -> list[PanelRow]:
     """Return the rows of a task's panel, the paper's WPT at the end."""
-    cells = {
-        key: cell
-        for key, cell in by_task(lines)[suite, task].items()
-        if not key.method.endswith(", last")
-    }
+    shown = {key: cell for key, cell in cells.items() if not key.method.endswith(", last")}
     rows = [
         PanelRow(label, cell.scores, STYLES.get(key.method, GREY))
-        for label, (key, cell) in zip(row_names(cells), cells.items(), strict=True)
+        for label, (key, cell) in zip(row_names(shown), shown.items(), strict=True)
     ]
     paper = paper_scores(suite)["wpt"].get(task)
     return rows if paper is None else [*rows, PanelRow(PAPER_NAME, [paper], None)]

@@ -10,9 +10,9 @@ from wpt_envs.tasks import TASKS
 from wpt_agents.zoo.numbers import evidence_text, span
 from wpt_agents.zoo.plan.methods import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
-from wpt_agents.zoo.report.aggregates import Aggregate, Estimate, Experiment
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, Aggregate, Estimate, Experiment
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.headline import OURS, PAPER_BUDGET, SUITES
+from wpt_agents.zoo.report.headline import OURS, SUITES
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs

@@ -1,10 +1,8 @@
 """Results as tables: the policies of one run, and the means of many runs over their seeds."""
 
-import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -13,7 +11,8 @@ from rich.table import Table
 
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.numbers import POSSIBLE, RULE, Range, interval_text, number, seeds_text
-from wpt_agents.zoo.report.aggregates import estimate, references
+from wpt_agents.zoo.record_lines import csv_of
+from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, estimate, references
 from wpt_agents.zoo.report.names import policy_name, policy_title
 from wpt_agents.zoo.result import POLICIES, UNTRAINED, Result, Variant
 from wpt_agents.zoo.statistics import mean, mean_interval
@@ -150,7 +149,7 @@ def paper_scores() -> dict[tuple[str, str], float]:
     return {
         (row.task, row.method): row.score
         for row in references()
-        if row.samples == 150_000 and row.score is not None
+        if row.samples == PAPER_BUDGET and row.score is not None
     }
 
 
@@ -279,11 +278,4 @@ def policy_note(rows: Sequence[PolicyRow]) -> str:
 
 def policy_csv(rows: Sequence[PolicyRow]) -> str:
     """Return the rows as CSV, unrounded; seeds, their means and commits are separated by spaces."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    names = [field.name for field in fields(PolicyRow)]
-    writer.writerow(names)
-    for row in rows:
-        values = [getattr(row, name) for name in names]
-        writer.writerow(" ".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
-    return file.getvalue()
+    return csv_of(PolicyRow, rows)

@@ -102,8 +102,8 @@ class Checkpoint:
 
         :raises ValueError: if one does not or has changed
         """
-        for name, checksum in self.state.files.items():
-            if _checksum(self.folder / name) != checksum:
+        for name, written in self.state.files.items():
+            if checksum(self.folder / name) != written:
                 raise ValueError(f"{name} has changed since it was written")
         for i in range(self.state.replay):
             if not _episode(run, i).exists():
@@ -164,7 +164,7 @@ def write_checkpoint(
         log={k: float(v) for k, v in log.name_to_value.items() if log.name_to_count[k]},
         ep_info=list(agent.ep_info_buffer or []),
         ep_success=[bool(s) for s in agent.ep_success_buffer or []],
-        files={path.name: _checksum(path) for path in sorted(aside.iterdir())},
+        files={path.name: checksum(path) for path in sorted(aside.iterdir())},
         cpu_seconds=cpu_seconds,
         origin=origin,
     )
@@ -216,7 +216,8 @@ def _episode(run: Path, number: int) -> Path:
     return run / "replay" / f"episode-{number:06}.zip"
 
 
-def _checksum(path: Path) -> str:
+def checksum(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -111,6 +111,7 @@ def make_shared(job: Run) -> None:
 
 def do(job: Run) -> None:
     """Execute the run of a job, with its output in the folder's `log.txt`."""
+    (job.folder / "error.txt").unlink(missing_ok=True)  # of an earlier attempt: see `trace_of`
     with logged(job.folder / "log.txt"):
         runner.run(job)
 

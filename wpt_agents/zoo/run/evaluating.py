@@ -1,7 +1,7 @@
 """Stage 5 of a run: the scores of all its policies, and pictures of the final one."""
 
-import hashlib
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -15,7 +15,7 @@ from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, Tr
 from wpt_agents.zoo.pictures import runs as pictures
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import BEST, HEAD_START, LAST, PRIOR_ACTOR, Score
-from wpt_agents.zoo.run.checkpoints import BEST_MODEL, HEAD_START_MODEL
+from wpt_agents.zoo.run.checkpoints import BEST_MODEL, HEAD_START_MODEL, checksum
 from wpt_agents.zoo.run.shared import play_untrained
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import say
@@ -26,26 +26,33 @@ HORIZON = 40  # number of images that it then predicts
 
 def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:
     """Stage 5: score every policy of the run, from the same initial states."""
+    episodes = counted(run.preset.evaluate.episodes, "episode")
+    say("evaluate", f"{episodes} of each policy, from the same initial states")
+    scores = {
+        name: play_untrained(run.shared, name, run.task, run.evaluation_seed) for name in BASELINES
+    }
+    return scores | {name: play(run, policy, name) for name, policy in policies(run, agent).items()}
+
+
+def play(run: Run, policy: PolicyPredictor, label: str) -> Score:
+    """Score a policy on the task of a run, from the initial states of all its policies."""
     episodes = run.preset.evaluate.episodes
     seed = run.evaluation_seed
-    say("evaluate", f"{counted(episodes, 'episode')} of each policy, from the same initial states")
-    scores = {name: play_untrained(run.shared, name, run.task, seed) for name in BASELINES}
-    for name, policy in policies(run, agent).items():
-        scores[name] = evaluate(
-            policy, run.task.id, run.shared.env, episodes, seed, name, run.algorithm.wrap
-        )
-    return scores
+    return evaluate(policy, run.task.id, run.shared.env, episodes, seed, label, run.algorithm.wrap)
 
 
 def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
     """Return the trained policies of the run, by name."""
+    load = partial(run.algorithm.agent.load, device=run.device)
+    trained: dict[str, PolicyPredictor] = {}
     prior: PolicyPredictor | None = getattr(agent, "prior", None)
-    trained = {PRIOR_ACTOR: prior} if prior is not None else {}
-    for name, file in ((HEAD_START, HEAD_START_MODEL), (BEST, BEST_MODEL)):
-        if (path := run.folder / file).exists():
-            trained[name] = run.algorithm.agent.load(path, device=run.device)
-        if name == HEAD_START:
-            trained[LAST] = agent
+    if prior is not None:
+        trained[PRIOR_ACTOR] = prior
+    if (head_start := run.folder / HEAD_START_MODEL).exists():
+        trained[HEAD_START] = load(head_start)
+    trained[LAST] = agent
+    if (best := run.folder / BEST_MODEL).exists():
+        trained[BEST] = load(best)
     return trained
 
 
@@ -55,16 +62,9 @@ def final_agent(run: Run, agent: BaseAlgorithm) -> BaseAlgorithm:
     return run.algorithm.agent.load(best, device=run.device) if best.exists() else agent
 
 
-def final_model(folder: Path) -> Path:
-    """Return the final model file: the best one if it was kept, else the last."""
-    best = folder / BEST_MODEL
-    return best if best.exists() else folder / "model.zip"
-
-
 def file_hash(path: Path) -> str:
     """Return the first digits of a file's SHA-256."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    return checksum(path)[:12]
 
 
 def draw(run: Run, agent: BaseAlgorithm, scores: Mapping[str, Score]) -> None:

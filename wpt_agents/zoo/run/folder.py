@@ -1,8 +1,10 @@
-"""The folder of a run: check its settings, and clear it."""
+"""The folder of a run: check its settings, clear it, and write what belongs to every run."""
 
 import json
 import shutil
-from collections.abc import Mapping
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ import yaml
 from wpt_agents.zoo.plan.methods import defaults
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.provenance import system
+from wpt_agents.zoo.text_files import write_json, write_text
 
 
 def clear(folder: Path) -> None:
@@ -28,6 +32,21 @@ def clear(folder: Path) -> None:
         elif path.name not in ("lock", config.name):
             path.unlink()
     config.unlink(missing_ok=True)
+
+
+@contextmanager
+def described(folder: Path, config: Mapping[str, Any], command: str) -> Iterator[None]:
+    """Write settings, machine and command, then do the block; its error goes to `error.txt`."""
+    failure = folder / "error.txt"
+    failure.unlink(missing_ok=True)
+    write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_json(folder / "system.json", system())
+    (folder / "command.txt").write_text(command + "\n", encoding="utf-8")
+    try:
+        yield
+    except Exception:
+        failure.write_text(traceback.format_exc(), encoding="utf-8")
+        raise
 
 
 def check_folder(job: Run, force: bool) -> None:

@@ -28,7 +28,7 @@ from wpt_agents.zoo.run.checkpoints import (
     Origin,
     resumes,
 )
-from wpt_agents.zoo.run.logs import Evaluations, go_to_episode
+from wpt_agents.zoo.run.logs import EvaluationCallback, go_to_episode
 from wpt_agents.zoo.run.progress import LearningBar
 from wpt_agents.zoo.tasks import metric_of, name_in_data, short_name
 from wpt_agents.zoo.terminal import say
@@ -141,7 +141,7 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None, origin:
     if checkpoint is not None:
         before = Effort(checkpoint.state.seconds, checkpoint.state.cpu_seconds)
         resume(run, agent, checkpoint)
-    every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up: 0 means none
+    every = -(-run.preset.learn.checkpoint_every // repeat)  # rounded up, so that only 0 stays 0
     checkpoints = Checkpoints(
         run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds, origin
     )
@@ -181,7 +181,7 @@ def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
         return
     venv = make_vec_env(run.task.id, run.shared.env, run.evaluation_seed + APART)
     with closing(run.algorithm.wrap(venv) if run.algorithm.wrap else venv) as wrapped:
-        callback = Evaluations(
+        callback = EvaluationCallback(
             wrapped,
             metric=metric_of(run.task),
             keep=run.folder / BEST_MODEL if settings.keep_best else None,

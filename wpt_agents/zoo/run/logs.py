@@ -8,11 +8,11 @@ import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from wpt_agents.zoo import learning_curves
+from wpt_agents.zoo.learning_curves import Evaluations
 from wpt_agents.zoo.result import Metric
 
 
-class Evaluations(EvalCallback):
+class EvaluationCallback(EvalCallback):
     """SB3's EvalCallback, which continues the evaluations in its folder.
 
     The best policy is the one with the highest mean return; if the task's metric is success, the
@@ -41,7 +41,7 @@ class Evaluations(EvalCallback):
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        before = learning_curves.Evaluations.read(Path(f"{self.log_path}.npz"))
+        before = Evaluations.read(Path(f"{self.log_path}.npz"))
         if before is not None:
             self.evaluations_timesteps = before.steps.tolist()
             self.evaluations_results = before.returns.tolist()

@@ -9,14 +9,13 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 
-import yaml
 from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.locks import locked, write_json
+from wpt_agents.zoo.judge.trained import final_model
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.provenance import commit, system
+from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.report import record_page, tables
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.result import Result, Score, read_result, write_result
@@ -27,8 +26,8 @@ from wpt_agents.zoo.run.checkpoints import (
     last_checkpoint,
     remove_checkpoints,
 )
-from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash, final_model
-from wpt_agents.zoo.run.folder import check_folder, clear
+from wpt_agents.zoo.run.evaluating import draw, evaluate_policies, file_hash
+from wpt_agents.zoo.run.folder import check_folder, clear, described
 from wpt_agents.zoo.run.learning import Effort, build_index, learn, make_agent, make_training_env
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.tasks import metric_of, short_name
@@ -94,16 +93,8 @@ def _finish(job: Run, force: bool) -> Result:
 
 def _begin(job: Run) -> Result:
     """Write the configuration into the folder, then execute the run."""
-    (job.folder / "error.txt").unlink(missing_ok=True)
-    with replacing(job.folder / "config.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False), encoding="utf-8")
-    write_json(job.folder / "system.json", system())
-    (job.folder / "command.txt").write_text(job.command + "\n", encoding="utf-8")
-    try:
+    with described(job.folder, job.config(), job.command):
         return do_stages(job)
-    except Exception:
-        (job.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-        raise
 
 
 class Clock:

@@ -7,14 +7,12 @@ sequence resumes exactly. The episodes of all tasks are kept until the sequence 
 """
 
 import shutil
-import traceback
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -24,15 +22,12 @@ from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
-from wpt_agents.files.archive import replacing
-from wpt_agents.zoo.judge.evaluation import evaluate
-from wpt_agents.zoo.locks import locked, write_json
-from wpt_agents.zoo.plan.runs import Run
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.sequences import SequenceRun
-from wpt_agents.zoo.provenance import commit, system
-from wpt_agents.zoo.result import Score
+from wpt_agents.zoo.provenance import commit
 from wpt_agents.zoo.run.checkpoints import Checkpoint, Origin, last_checkpoint
-from wpt_agents.zoo.run.folder import check_config, clear
+from wpt_agents.zoo.run.evaluating import play
+from wpt_agents.zoo.run.folder import check_config, clear, described
 from wpt_agents.zoo.run.learning import (
     build_index,
     learn,
@@ -93,18 +88,9 @@ def run_sequence(job: SequenceRun, force: bool = False) -> SequenceResult:
         return done
     with locked(job.folder / "lock"):
         if force:
-            (job.folder / "sequence.json").unlink(missing_ok=True)
             clear(job.folder)
-        (job.folder / "error.txt").unlink(missing_ok=True)
-        with replacing(job.folder / "config.yaml") as temporary:
-            temporary.write_text(yaml.safe_dump(job.config(), sort_keys=False), encoding="utf-8")
-        write_json(job.folder / "system.json", system())
-        (job.folder / "command.txt").write_text(job.runs[0].command + "\n", encoding="utf-8")
-        try:
+        with described(job.folder, job.config(), job.runs[0].command):
             return _do_tasks(job)
-        except Exception:
-            (job.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-            raise
 
 
 def _do_tasks(job: SequenceRun) -> SequenceResult:
@@ -165,7 +151,7 @@ def _learn_task(job: SequenceRun, number: int) -> Row:
         agent.save(run.folder / "model.zip")
     made = sum(row.updates for row in map(read_row, _folders(job, number)) if row is not None)
     scores = {
-        short_name(played.task): _play(played, policy_of(agent, place))
+        short_name(played.task): play(played, policy_of(agent, place), short_name(played.task))
         for place, played in enumerate(job.runs[: number + 1])
     }
     return Row(
@@ -226,17 +212,3 @@ def _keep(agent: BaseAlgorithm, folders: Sequence[Path]) -> None:
 def policy_of(agent: BaseAlgorithm, task: int) -> PolicyPredictor:
     """Return the policy for a task of the sequence; PackNet has one for each task."""
     return agent.policy_of(task) if isinstance(agent, PackNet) else agent
-
-
-def _play(run: Run, policy: PolicyPredictor) -> Score:
-    episodes = run.preset.evaluate.episodes
-    name = short_name(run.task)
-    return evaluate(
-        policy,
-        run.task.id,
-        run.shared.env,
-        episodes,
-        run.evaluation_seed,
-        name,
-        run.algorithm.wrap,
-    )

@@ -3,7 +3,6 @@
 Each is executed once and reused by later runs; an unfinished one is continued.
 """
 
-import json
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -18,13 +17,14 @@ from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import counted, unknown_name
 from wpt_agents.training.distributed import World
 from wpt_agents.training.model_files import shipped
-from wpt_agents.zoo.collect.collection import collect
+from wpt_agents.zoo.collect.collection import collect, read_label
 from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import BASELINES
-from wpt_agents.zoo.locks import locked, write_json
+from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.shared import Shared, key
 from wpt_agents.zoo.result import Score, read_score, write_score
 from wpt_agents.zoo.terminal import say
+from wpt_agents.zoo.text_files import write_json
 
 
 def collect_data(shared: Shared) -> TrajectoryDataset:
@@ -61,11 +61,8 @@ def _collected(shared: Shared) -> TrajectoryDataset:
 
 def _warn_of_differences(shared: Shared) -> None:
     """Warn about data that `collect` recorded with other environment settings than the task's."""
-    label = shared.data_path / "collect.json"
-    recorded: dict[str, Any] = (
-        json.loads(label.read_text(encoding="utf-8"))["env"] if label.exists() else {}
-    )
-    for name, value in recorded.items():
+    recorded = read_label(shared.data_path)
+    for name, value in recorded.get("env", {}).items():
         ours = shared.env.get(name, value)
         if ours != value:
             say("warning", f"data of {name}={value}, but the task has {name}={ours}")

@@ -1,17 +1,16 @@
 """The progress of the runs of a plan, one line each, read from their folders."""
 
-import fcntl
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from rich.live import Live
 from rich.table import Table
 
 from wpt_agents.zoo.learning_curves import MONITOR, TrainingEpisodes
+from wpt_agents.zoo.locks import is_locked
 from wpt_agents.zoo.numbers import number
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.tasks import short_name
@@ -48,7 +47,7 @@ def standing(job: Run) -> Standing:
         return Standing("failed", steps, recent)
     if not (folder / "config.yaml").exists():
         return Standing("waiting")
-    if not is_locked(folder):
+    if not is_locked(folder / "lock"):
         return Standing("stopped", steps, recent)
     if not len(played):
         return Standing("preparing")
@@ -66,26 +65,14 @@ def speed(lengths: np.ndarray, times: np.ndarray) -> float | None:
     return float(lengths[1:].sum() / (times[-1] - times[0]))
 
 
-def is_locked(folder: Path) -> bool:
-    """Return whether a process works on the run, on any machine if the file system has locks."""
-    path = folder / "lock"
-    if not path.exists():
-        return False
-    with open(path, encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
 def overview(jobs: Sequence[Run]) -> Table:
     """Return a table with a line per run: progress, return, speed, remaining time."""
     table = Table("task", "method", "seed", "state")
     for heading in ("frames", "done", "return", "steps/s", "time left"):
         table.add_column(heading, justify="right")
     for job in jobs:
-        now, steps = standing(job), job.preset.steps
+        now = standing(job)
+        steps = job.preset.steps
         left = (steps - now.steps) / now.speed if now.speed else None
         table.add_row(
             *(short_name(job.task), job.method, str(job.seed), now.state),
@@ -99,7 +86,7 @@ def overview(jobs: Sequence[Run]) -> Table:
 
 
 def clock(seconds: float) -> str:
-    """'1:02:03'."""
+    """Format a duration as '1:02:03'."""
     minutes, rest = divmod(round(max(seconds, 0)), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 

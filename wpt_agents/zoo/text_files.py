@@ -10,7 +10,7 @@ from wpt_agents.files.archive import replacing
 Content = TypeVar("Content")
 
 
-def write_text(path: Path, text: str) -> None:
+def write_atomically(path: Path, text: str) -> None:
     """Write `text` to `path` atomically."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -18,7 +18,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write `value` to `path` atomically."""
-    write_text(path, json.dumps(value, indent=1))
+    write_atomically(path, json.dumps(value, indent=1))
 
 
 def read_json(path: Path, build: Callable[[Any], Content]) -> Content | None:

@@ -60,7 +60,7 @@ def report(
     from wpt_agents.zoo.report.steadiness import markdown as steadiness_markdown
     from wpt_agents.zoo.report.steadiness import steadiness
     from wpt_agents.zoo.terminal import console
-    from wpt_agents.zoo.text_files import write_text
+    from wpt_agents.zoo.text_files import write_atomically
 
     if record is not None:
         record_page.check(record)
@@ -92,8 +92,8 @@ def report(
     else:
         page = (out or folder / "report") / "index.html"
         write_page(folder, page, media, runs)
-        write_text(page.with_name("report.md"), as_markdown)
-        write_text(page.with_name("policies.csv"), tables.policy_csv(policies))
+        write_atomically(page.with_name("report.md"), as_markdown)
+        write_atomically(page.with_name("policies.csv"), tables.policy_csv(policies))
         if rows:
             console.print(tables.summary_table(rows))
         if sequences:

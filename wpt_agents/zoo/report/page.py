@@ -24,7 +24,7 @@ from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, f
 from wpt_agents.zoo.report.names import MEANINGS, policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
 from wpt_agents.zoo.result import Result, Score, Variant
-from wpt_agents.zoo.text_files import write_text
+from wpt_agents.zoo.text_files import write_atomically
 
 MEDIA = ("first", "all", "none")
 
@@ -47,7 +47,7 @@ def write_page(
     check_media(media)
     sequences = figure4.find_sequences(folder)
     runs = find_finished(folder) if runs is None else runs
-    write_text(path, render(runs, find_unfinished(folder), media, sequences))
+    write_atomically(path, render(runs, find_unfinished(folder), media, sequences))
 
 
 def render(

@@ -15,7 +15,7 @@ from wpt_agents.zoo.report.aggregates import BEST_RETURN
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.result import UNTRAINED, Result
-from wpt_agents.zoo.text_files import write_text
+from wpt_agents.zoo.text_files import write_atomically
 
 KNOWN = (  # of methods in tables: the simplest first, then the paper's ablation, then ours
     *("nothing", "random", "prior actor", "scratch", "pretrain-only", "no-guidance"),
@@ -82,7 +82,7 @@ def update(path: Path, lines: Iterable[Line]) -> list[Line]:
     before = [line for line in known if line.agent not in again]
     warn_of_replaced(path, known, lines)
     every = sorted({line.run: line for line in [*before, *lines]}.values(), key=order)
-    write_text(path, csv_of(Line, every))
+    write_atomically(path, csv_of(Line, every))
     return every
 
 

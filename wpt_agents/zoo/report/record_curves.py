@@ -31,7 +31,7 @@ from wpt_agents.zoo.report.record_picture import (
     styles_of,
 )
 from wpt_agents.zoo.result import PRIOR_ACTOR, Variant
-from wpt_agents.zoo.text_files import write_text
+from wpt_agents.zoo.text_files import write_atomically
 
 COLUMNS = 5  # panels in a row
 
@@ -85,7 +85,7 @@ def update(record: Path, points: Iterable[Point]) -> list[Point]:
     before = [point for point in read(record) if point.run not in again]
     every = sorted([*before, *points], key=lambda p: (p.suite, *p.run, p.at))
     if every:
-        write_text(place_of(record), csv_of(Point, every))
+        write_atomically(place_of(record), csv_of(Point, every))
     return every
 
 

@@ -8,7 +8,7 @@ from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report import evidence, pairs, record_curves, record_picture, record_tables
 from wpt_agents.zoo.report import record as records
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.text_files import write_text
+from wpt_agents.zoo.text_files import write_atomically
 
 INTRODUCTION = """\
 # Recorded scores
@@ -53,7 +53,7 @@ def renew(record: Path) -> None:
 
 def write(record: Path, lines: Sequence[Line]) -> None:
     """Write the tables and the pictures of a record beside it."""
-    write_text(record.with_suffix(".md"), markdown(lines))
+    write_atomically(record.with_suffix(".md"), markdown(lines))
     record_picture.draw(record.with_suffix(".png"), lines)
     record_curves.draw(record, record_curves.read(record), lines)
 

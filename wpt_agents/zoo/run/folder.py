@@ -14,7 +14,7 @@ from wpt_agents.zoo.plan.methods import defaults
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.provenance import system
-from wpt_agents.zoo.text_files import write_json, write_text
+from wpt_agents.zoo.text_files import write_atomically, write_json
 
 
 def clear(folder: Path) -> None:
@@ -39,7 +39,7 @@ def described(folder: Path, config: Mapping[str, Any], command: str) -> Iterator
     """Write settings, machine and command, then do the block; its error goes to `error.txt`."""
     failure = folder / "error.txt"
     failure.unlink(missing_ok=True)
-    write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_atomically(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False))
     write_json(folder / "system.json", system())
     (folder / "command.txt").write_text(command + "\n", encoding="utf-8")
     try:

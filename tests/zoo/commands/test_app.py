@@ -101,7 +101,7 @@ def test_from_nothing_looks_at_the_presets_of_the_sequence(monkeypatch, capsys, 
     assert call(monkeypatch, "run", *words) == 0
     assert "world model  dmc-mid, which ships" in capsys.readouterr().out
     assert call(monkeypatch, "run", *words, "--from-nothing") == 0
-    assert "world model  3,000 updates to make" in capsys.readouterr().out
+    assert "world model  9,000 updates to make" in capsys.readouterr().out
 
 
 def test_from_nothing_changes_no_label_where_a_preset_pre_trains_anyway(monkeypatch, tmp_path):

@@ -145,7 +145,7 @@ def dream(model: WPT, samples: int = 1) -> Predict:
             model.policy.world_model.open_loop(batch, CONTEXT, generator).cpu().numpy()
             for _ in range(samples)
         ]
-        return futures[0] if samples == 1 else np.mean(futures, 0, np.float32)
+        return futures[0] if samples == 1 else np.stack(futures).mean(0, np.float32)
 
     return predict
 

@@ -134,8 +134,8 @@ def windows(trajectory: Trajectory, number: int, width: int) -> Batch:
 def dream(model: WPT, samples: int = 1) -> Predict:
     """Predict open-loop with the world model: the mean image of some samples of the latents.
 
-    Where the future is uncertain, the expected squared error of one sample is up to twice that of
-    the mean of many, which is the best prediction by this error.
+    If a model knows how uncertain the future is, the expected squared error of one sample is up to
+    twice that of the mean of many, which is the best prediction by this error.
     """
 
     def predict(batch: Batch) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM, deferred until an update is complete and the model is saved."""
 
+import os
 import signal
 import threading
 from types import FrameType
@@ -23,20 +24,27 @@ class StopSignals:
     Signals that the process ignores stay ignored, and outside of the main thread, where Python
     handles no signals, the block changes nothing.
 
+    :param message: what the first signal prints to the standard error, "" for nothing
     :ivar received: the number of the signal that was received, 0 for none
     """
 
-    def __init__(self) -> None:
+    def __init__(self, message: str = "") -> None:
+        self.message = message
         self.received = 0
         self._before: dict[int, Any] = {}  # handlers by signal
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            for number in SIGNALS:
-                handler = signal.getsignal(number)
-                if handler not in (signal.SIG_IGN, None):
-                    self._before[number] = signal.signal(number, self._note)
+        self.start()
         return self
+
+    def start(self) -> None:
+        """Begin to take note of signals; without effect if it has begun."""
+        if self._before or threading.current_thread() is not threading.main_thread():
+            return
+        for number in SIGNALS:
+            handler = signal.getsignal(number)
+            if handler not in (signal.SIG_IGN, None):
+                self._before[number] = signal.signal(number, self._note)
 
     def __exit__(self, *_: object) -> None:
         self._restore()
@@ -47,6 +55,8 @@ class StopSignals:
         if self.received:
             self.deliver(number)
         self.received = number
+        if self.message:  # not by `print`, which the signal may have interrupted
+            os.write(2, f"\n{self.message}\n".encode())
 
     def deliver(self, number: int) -> None:
         """Let a signal do what it would have done without this block.

@@ -1,5 +1,6 @@
 """Seeded copies of a task, whose episodes do not depend on those before them."""
 
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,8 @@ def make_vec_env(
     def make() -> gym.Env:
         import wpt_envs  # noqa: F401  # registers the ids in worker processes
 
+        if workers:  # a terminal sends Ctrl-C to them, too, and the episode is yet to be completed
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         made = EpisodeSeeds(gym.make(task, **env))
         return Monitor(made, monitor, info_keywords=logged, override_existing=new)
 

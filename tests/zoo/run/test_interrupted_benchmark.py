@@ -19,28 +19,30 @@ SEEDS = range(4)
 LEARN = {"learn": {"frames": 75, "checkpoint_every": 25}}
 
 SCRIPT = """
-import sys; sys.path[:0] = {places!r}
+import signal, sys; sys.path[:0] = {places!r}
 from pathlib import Path
 import dot_runs, gymnasium
 from engine_work import do_dot
-from test_interrupted_benchmark import LEARN, SEEDS
+from test_interrupted_benchmark import SEEDS
 from wpt_envs.tasks import TASKS
 from wpt_agents.zoo.run import engines
 engines.do = do_dot
 if __name__ == "__main__":
     TASKS[dot_runs.DOT.id] = dot_runs.DOT
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background jobs
     gymnasium.register(dot_runs.DOT.id, entry_point=dot_runs.make_dot)
-    jobs = [dot_runs.job(Path({out!r}), "scratch", seed, **LEARN) for seed in SEEDS]
+    jobs = [dot_runs.job(Path({out!r}), "scratch", seed, learn={learn!r}) for seed in SEEDS]
     sys.exit(not engines.run_on("local", jobs, False, engines.Resources(workers=4)))
 """
 
 
-def orchestrator(folder):
+def orchestrator(folder, **learn):
     """The process that does all runs, with a worker for each."""
     tests = Path(__file__).parents[2]
     places = [str(tests / "zoo" / "run"), str(tests / "helpers"), str(tests / "agents")]
     script = folder / "benchmark.py"
-    script.write_text(SCRIPT.format(places=places, out=str(folder / "runs")))
+    learn = LEARN["learn"] | learn
+    script.write_text(SCRIPT.format(places=places, out=str(folder / "runs"), learn=learn))
     path = os.pathsep.join([*places, *filter(None, sys.path)])
     return subprocess.Popen(
         [sys.executable, str(script)],
@@ -90,6 +92,19 @@ def test_a_benchmark_killed_twice_ends_with_each_run_once_and_finished_ones_unto
     assert len(read_results(tmp_path / "runs")) == len(SEEDS)
     for one, other in zip(broken, whole, strict=True):
         assert untimed(read_result(one.folder)) == untimed(read_result(other.folder))
+
+
+def test_after_ctrl_c_each_run_has_a_checkpoint_of_its_last_episode(tmp_path):
+    runs = [job(tmp_path / "runs", "scratch", seed, **LEARN) for seed in SEEDS]
+    process = orchestrator(tmp_path, checkpoint_every=1000, frames=2000)
+    logs = [one.folder / "0.monitor.csv" for one in runs]
+    until(lambda: all(log.exists() and log.read_text().count("\n") > 2 for log in logs), process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    assert b"KeyboardInterrupt" in process.communicate(timeout=300)[1]
+    for one, log in zip(runs, logs, strict=True):
+        steps = sum(int(row.split(",")[1]) for row in log.read_text().splitlines()[2:])
+        (written,) = (one.folder / "checkpoints").iterdir()
+        assert written.name == f"step-{steps:09}"
 
 
 def test_a_run_that_always_fails_leaves_the_others_and_is_named_with_its_log(

@@ -2,7 +2,9 @@
 
 import fcntl
 import json
+import os
 import shutil
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -23,7 +25,7 @@ from wpt_agents.training.learner import Learner
 from wpt_agents.zoo import locks
 from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.run import learning, runner
+from wpt_agents.zoo.run import checkpoints, learning, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
 from wpt_agents.zoo.run.evaluating import file_hash
 from wpt_agents.zoo.run.progress import LearningBar
@@ -111,6 +113,77 @@ def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeyp
     assert "continued at 125 of" in capsys.readouterr().out
     assert_equal(left(broken.folder), left(whole.folder))
     assert not (broken.folder / "replay").exists()
+
+
+class SignalAt(LearningBar):
+    """Send this process a signal at some steps."""
+
+    def __init__(self, number, *steps):
+        super().__init__(frames_a_step=1)
+        self.number = number
+        self.steps = steps
+
+    def _on_step(self):
+        if self.num_timesteps in self.steps:
+            os.kill(os.getpid(), self.number)
+        return super()._on_step()
+
+
+def interrupted_at(monkeypatch, one, number, *steps):
+    """Do the run until the signals at these steps end it, as the signal's own handler does."""
+    with monkeypatch.context() as patch:
+        patch.setattr(learning, "LearningBar", lambda _: SignalAt(number, *steps))
+        before = signal.signal(number, signal.default_int_handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                run(one)
+        finally:
+            assert signal.signal(number, before) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_completes_its_episode_and_continues_from_there(
+    number, tmp_path, monkeypatch, capfd
+):
+    changes = CHANGES | {"learn": {"frames": 150, "checkpoint_every": 1000}}
+    whole, broken = (job(folder, **changes) for folder in (tmp_path / "whole", tmp_path))
+    run(whole)
+    interrupted_at(monkeypatch, broken, number, 40)
+    assert capfd.readouterr().err.count("Press Ctrl-C again") == 1
+    (written,) = (broken.folder / "checkpoints").iterdir()
+    assert written.name == "step-000000050"
+    run(broken)
+    assert "continued at 50 of" in capfd.readouterr().out
+    assert_equal(left(broken.folder), left(whole.folder))
+
+
+def test_a_second_signal_stops_a_run_at_once(tmp_path, monkeypatch):
+    one = job(tmp_path, learn={"frames": 150, "checkpoint_every": 1000})
+    interrupted_at(monkeypatch, one, signal.SIGINT, 40, 42)
+    assert last_checkpoint(one.folder) is None
+
+
+def test_a_signal_before_the_first_episode_takes_effect_at_once(tmp_path, monkeypatch):
+    one = job(tmp_path, "scratch", **CHANGES)
+    monkeypatch.setattr(WPT, "clone", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(one)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not (one.folder / "0.monitor.csv").read_text().count("\n") > 2
+
+
+def test_a_slow_run_has_a_checkpoint_every_ten_minutes(tmp_path, monkeypatch):
+    one = job(tmp_path, "scratch", learn={"frames": 150, "checkpoint_every": 1000})
+    clock = iter(range(0, 10**6, 400))  # two episodes take more than ten minutes
+    monkeypatch.setattr(
+        checkpoints, "time", SimpleNamespace(**vars(time) | {"monotonic": lambda: next(clock)})
+    )
+    killed_at(110, monkeypatch, one)
+    names = sorted(path.name for path in (one.folder / "checkpoints").iterdir())
+    assert names == ["step-000000050", "step-000000100"]
 
 
 def test_a_run_that_goes_on_counts_what_is_done_in_frames(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,8 @@
 import csv
 import hashlib
 import json
+import os
+import signal
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -135,6 +137,14 @@ def test_an_environment_beside_the_learner_changes_nothing_but_the_time(tmp_path
         next((tmp_path / str(overlap)).rglob("progress.csv")) for overlap in (True, False)
     )
     assert _without_times(beside) == _without_times(alone) != []
+
+
+def test_an_environment_beside_the_learner_survives_ctrl_c():
+    venv = make_vec_env("wpt/metaworld-reach-v0", {"rendering": "fast"}, 0, workers=True)
+    with closing(venv):
+        venv.reset()
+        os.kill(venv.processes[0].pid, signal.SIGINT)
+        venv.step(np.zeros((1, 4), np.float32))
 
 
 def _without_times(path):

@@ -89,7 +89,8 @@ class PretrainSettings(Section):
 class LearnSettings(Section):
     """Fine-tuning; frames are simulator frames, `env.step` calls times the action repeat.
 
-    A killed run resumes from the last multiple of `checkpoint_every` frames; 0: only from the end.
+    A killed run resumes from the last checkpoint: there is one every `checkpoint_every` frames, and
+    every ten minutes if these take longer. 0: only from the end.
     With `train_freq: step` the environment has its own process and steps during the updates;
     `overlap: false` keeps it in the learner's process, with the same results.
     """

@@ -24,11 +24,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.files.archive import sync_folder
+from wpt_agents.training.signals import StopSignals
 
 BEST_MODEL = "best_model.zip"
 HEAD_START_MODEL = "head_start_model.zip"
 LOGS = ("0.monitor.csv", "progress.csv", "evaluations.npz", BEST_MODEL, HEAD_START_MODEL)
 KEEP = 2
+SECONDS = 600  # between checkpoints, if `every` steps take longer
+STOPPING = (
+    "The run stops after this episode and its updates, so that it can continue from there. "
+    "Press Ctrl-C again to stop at once and lose the steps since the last checkpoint."
+)
 STATE = "state.json"
 
 
@@ -223,11 +229,15 @@ def checksum(path: Path) -> str:
 
 
 class Checkpoints(BaseCallback):
-    """Write a checkpoint every few steps, between episodes, and at the end of learning.
+    """Write checkpoints between episodes, at the end of learning, and when the process is stopped.
+
+    Between episodes one is written if the last is `every` steps or ten minutes old. After Ctrl-C
+    or SIGTERM the episode and its updates are completed, a checkpoint is written, and only then
+    the signal takes effect; a second one takes effect at once.
 
     It also measures the cost of learning over all processes that took part.
 
-    :param every: steps between checkpoints; 0: only at the end, None: never
+    :param every: steps between checkpoints; 0: only at the end or on a signal, None: never
     :param seconds: wall-clock seconds of learning in earlier processes
     :param cpu_seconds: processor seconds of learning in earlier processes
     :param origin: what was done before learning
@@ -246,6 +256,8 @@ class Checkpoints(BaseCallback):
         self.origin = origin
         self.every = every
         self.written = 0
+        self.written_at = 0.0  # on the clock of `time.monotonic`
+        self.signals = StopSignals(STOPPING)
         self.start = time.perf_counter() - seconds
         self.cpu_start = time.process_time() - cpu_seconds
 
@@ -261,12 +273,19 @@ class Checkpoints(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.written = self.model.num_timesteps
+        self.written_at = time.monotonic()
 
     def _on_rollout_start(self) -> None:
         starts = self.model._last_episode_starts
-        between = starts is not None and starts.all()  # but not within a long episode
-        if self.every and between and self.model.num_timesteps - self.written >= self.every:
+        if self.every is None or starts is None or not starts.all():  # within a long episode
+            return
+        self.signals.start()  # not sooner: nothing can be saved while the prior actor is trained
+        steps = self.model.num_timesteps - self.written
+        due = self.every and (steps >= self.every or time.monotonic() - self.written_at >= SECONDS)
+        if steps and (due or self.signals.received):
             self._write()
+        if self.signals.received:
+            self.signals.deliver(self.signals.received)
 
     def _on_step(self) -> bool:
         return True
@@ -280,6 +299,7 @@ class Checkpoints(BaseCallback):
     def _write(self) -> None:
         write_checkpoint(self.model, self.run, self.seconds, self.cpu_seconds, self.origin)
         self.written = self.model.num_timesteps
+        self.written_at = time.monotonic()
 
 
 class HeadStart(BaseCallback):

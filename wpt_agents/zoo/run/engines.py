@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -35,6 +35,10 @@ from wpt_agents.zoo.terminal import console, logged, say
 Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called repeatedly while waiting; should be fast
 Errors = dict[Path, str]  # by run folder, of the runs that failed
+STOPPING = (
+    "each run stops after its episode and the updates of it, so that it can continue from there; "
+    "Ctrl-C again stops them at once"
+)
 
 
 @dataclass(frozen=True)
@@ -146,9 +150,11 @@ class Local:
                     elif code:
                         trace = job.shared.log if work is make_shared else trace_of(job.folder)
                         errors[job.folder] = why(trace, code)
+        except KeyboardInterrupt:
+            say("stop", STOPPING)
+            raise
         finally:
-            for process in running:
-                process.terminate()
+            stop(running)
         return errors
 
     def start(self, work: Work, job: Run) -> BaseProcess:
@@ -165,11 +171,25 @@ def _in_process(work: Work, job: Run, cpus: int) -> None:
     work(job)
 
 
+def stop(processes: Collection[BaseProcess]) -> None:
+    """End processes as soon as they have saved their work; Ctrl-C meanwhile kills them."""
+    for process in processes:
+        process.terminate()
+    try:
+        for process in processes:
+            process.join()
+    except KeyboardInterrupt:
+        for process in processes:
+            process.kill()
+        raise
+
+
 def _in_child(work: Work, job: Run, cpus: int) -> None:
     end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal; the parent decides: see `stop`
     try:
         _in_process(work, job, cpus)
-    except (Exception, KeyboardInterrupt):  # the job's log has the traceback; the parent reports it
+    except Exception:  # the job's log has the traceback; the parent reports it
         sys.exit(1)
 
 

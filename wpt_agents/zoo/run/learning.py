@@ -1,7 +1,7 @@
 """Stages 3 and 4 of a run: the index over the data, and fine-tuning."""
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,7 +145,10 @@ def learn(run: Run, agent: BaseAlgorithm, checkpoint: Checkpoint | None, origin:
     checkpoints = Checkpoints(
         run.folder, every if resumes(agent) else None, before.seconds, before.cpu_seconds, origin
     )
-    with closing(logger), evaluations(run) as evaluation:
+    with ExitStack() as stack:
+        stack.enter_context(closing(logger))
+        stack.push(checkpoints.signals)  # a signal in the last episode takes effect at the end
+        evaluation = stack.enter_context(evaluations(run))
         callbacks = [LearningBar(repeat), *evaluation, HeadStart(run.folder), checkpoints]
         agent.learn(
             steps - agent.num_timesteps,

@@ -184,13 +184,20 @@ def test_a_second_signal_stops_a_run_at_once(tmp_path, monkeypatch):
 
 def test_a_signal_before_the_first_episode_takes_effect_at_once(tmp_path, monkeypatch):
     one = job(tmp_path, "scratch", **CHANGES)
-    monkeypatch.setattr(WPT, "clone", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    went_on = []
+
+    def clone(*_):
+        os.kill(os.getpid(), signal.SIGINT)
+        went_on.append(True)
+
+    monkeypatch.setattr(WPT, "clone", clone)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             run(one)
     finally:
         signal.signal(signal.SIGINT, before)
+    assert not went_on
     assert not (one.folder / "0.monitor.csv").read_text().count("\n") > 2
 
 

@@ -272,6 +272,33 @@ def test_a_signal_after_the_last_update_is_not_lost():
         signal.raise_signal(signal.SIGINT)
 
 
+def test_a_message_that_nobody_reads_stops_nothing(monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    before = os.dup(2)
+    os.dup2(writer, 2)
+    noted = 0
+    try:
+        with os.fdopen(writer, "w") as gone:
+            monkeypatch.setattr(sys, "stderr", gone)
+            with pytest.raises(KeyboardInterrupt), StopSignals("stopping") as signals:
+                signal.raise_signal(signal.SIGINT)
+                noted = signals.received  # not reached if the handler raises an error
+    finally:
+        monkeypatch.undo()
+        os.dup2(before, 2)
+        os.close(before)
+    assert noted == signal.SIGINT
+
+
+def test_a_message_is_where_the_standard_error_goes(tmp_path, monkeypatch):
+    with open(tmp_path / "log.txt", "w") as log:
+        monkeypatch.setattr(sys, "stderr", log)
+        with pytest.raises(KeyboardInterrupt), StopSignals("stopping"):
+            signal.raise_signal(signal.SIGINT)
+    assert (tmp_path / "log.txt").read_text() == "\nstopping\n"
+
+
 def test_ignored_signals_stay_ignored_and_threads_are_left_alone():
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:

@@ -2,7 +2,9 @@
 
 import os
 import signal
+import sys
 import threading
+from contextlib import suppress
 from types import FrameType
 from typing import Any, Self
 
@@ -55,8 +57,11 @@ class StopSignals:
         if self.received:
             self.deliver(number)
         self.received = number
-        if self.message:  # not by `print`, which the signal may have interrupted
-            os.write(2, f"\n{self.message}\n".encode())
+        if self.message:
+            # Not by `print`, which the signal may have interrupted. Ctrl-C also ends the program
+            # that reads the output, such as `tee`, and a notebook's output is no file.
+            with suppress(OSError, ValueError):
+                os.write(sys.stderr.fileno(), f"\n{self.message}\n".encode())
 
     def deliver(self, number: int) -> None:
         """Let a signal do what it would have done without this block.

@@ -19,12 +19,11 @@ def import_extra(name: str, extra: str) -> ModuleType:
     """Import the module of an extra, or raise an error with the command that installs it."""
     try:
         return importlib.import_module(name)
-    except ModuleNotFoundError:
-        raise ValueError(f'{name} is not installed: pip install "wpt-agents[{extra}]"') from None
-    except ImportError as error:  # for example of a shared library, or of another version
-        raise ValueError(
-            f'{name} cannot be imported ({error}): pip install "wpt-agents[{extra}]"'
-        ) from error
+    except ImportError as error:
+        missing = isinstance(error, ModuleNotFoundError) and error.name == name.split(".")[0]
+        # If it is there, it lacks for example a shared library, or a package that it needs.
+        reason = "is not installed" if missing else f"cannot be imported ({error})"
+        raise ValueError(f'{name} {reason}: pip install "wpt-agents[{extra}]"') from error
 
 
 def check_machine(engine: str, device: str) -> None:

@@ -36,3 +36,14 @@ def test_the_strip_of_a_run_says_the_same(drawn, tmp_path):
     assert upper[:3] == ["first\nseen", "last\nseen", "1 step\nahead"]
     assert upper[-1] == "40 steps\nahead" and len(upper) == 12
     assert figure.get_suptitle().startswith("arm, wpt, seed 0\nabove: what happened")
+
+
+def test_the_mean_of_samples_looks_unlike_a_single_prediction(drawn, tmp_path):
+    names = ("world model", "world model, mean of 8", "other", "other, mean of 8", "mean frame")
+    errors = np.ones((3, 41))
+    curves = [predictions.Curve("arm", name, *errors) for name in names]
+    predictions.draw_curves(tmp_path / "a.png", curves)
+    (figure,) = drawn
+    lines = figure.axes[0].get_lines()
+    assert [line.get_label() for line in lines] == list(names)
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(names)

@@ -80,8 +80,13 @@ def test_local_does_not_try_again_what_failed_by_itself(tmp_path):
 
 def test_a_process_ends_without_a_traceback_on_the_terminal(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(engines, "end_with_parent", lambda: None)
-    with pytest.raises(SystemExit, match="1"):
-        engines._in_child(fail, job(tmp_path), 1)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit, match="1"):
+            engines._in_child(fail, job(tmp_path), 1)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # the parent decides
+    finally:
+        signal.signal(signal.SIGINT, before)  # of the process of the tests
     assert capsys.readouterr().err == ""
 
 

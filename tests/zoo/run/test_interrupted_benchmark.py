@@ -94,13 +94,18 @@ def test_a_benchmark_killed_twice_ends_with_each_run_once_and_finished_ones_unto
         assert untimed(read_result(one.folder)) == untimed(read_result(other.folder))
 
 
-def test_after_ctrl_c_each_run_has_a_checkpoint_of_its_last_episode(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_benchmark_has_a_checkpoint_of_each_runs_last_episode(number, tmp_path):
     runs = [job(tmp_path / "runs", "scratch", seed, **LEARN) for seed in SEEDS]
     process = orchestrator(tmp_path, checkpoint_every=1000, frames=2000)
     logs = [one.folder / "0.monitor.csv" for one in runs]
     until(lambda: all(log.exists() and log.read_text().count("\n") > 2 for log in logs), process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    assert b"KeyboardInterrupt" in process.communicate(timeout=300)[1]
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as a terminal does
+    else:
+        process.send_signal(number)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == -number, said.decode()
     for one, log in zip(runs, logs, strict=True):
         steps = sum(int(row.split(",")[1]) for row in log.read_text().splitlines()[2:])
         (written,) = (one.folder / "checkpoints").iterdir()

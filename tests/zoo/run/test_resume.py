@@ -129,10 +129,23 @@ class SignalAt(LearningBar):
         return super()._on_step()
 
 
-def interrupted_at(monkeypatch, one, number, *steps):
+class UnreadSignalAt(SignalAt):
+    """Ctrl-C also ends the program that reads the output."""
+
+    def _on_step(self):
+        if self.num_timesteps in self.steps:
+            self.bar.mininterval = 0  # draw it every time
+            self.bar.sp = self.broken_pipe
+        return super()._on_step()
+
+    def broken_pipe(self, _):
+        raise BrokenPipeError
+
+
+def interrupted_at(monkeypatch, one, number, *steps, bar=SignalAt):
     """Do the run until the signals at these steps end it, as the signal's own handler does."""
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "LearningBar", lambda _: SignalAt(number, *steps))
+        patch.setattr(learning, "LearningBar", lambda _: bar(number, *steps))
         before = signal.signal(number, signal.default_int_handler)
         try:
             with pytest.raises(KeyboardInterrupt):
@@ -157,6 +170,12 @@ def test_an_interrupted_run_completes_its_episode_and_continues_from_there(
     assert_equal(left(broken.folder), left(whole.folder))
 
 
+def test_an_interrupted_run_has_a_checkpoint_also_if_its_output_was_piped(tmp_path, monkeypatch):
+    one = job(tmp_path, "scratch", learn={"frames": 150, "checkpoint_every": 1000})
+    interrupted_at(monkeypatch, one, signal.SIGINT, 40, bar=UnreadSignalAt)
+    assert last_checkpoint(one.folder).folder.name == "step-000000050"
+
+
 def test_a_second_signal_stops_a_run_at_once(tmp_path, monkeypatch):
     one = job(tmp_path, learn={"frames": 150, "checkpoint_every": 1000})
     interrupted_at(monkeypatch, one, signal.SIGINT, 40, 42)
@@ -165,13 +184,20 @@ def test_a_second_signal_stops_a_run_at_once(tmp_path, monkeypatch):
 
 def test_a_signal_before_the_first_episode_takes_effect_at_once(tmp_path, monkeypatch):
     one = job(tmp_path, "scratch", **CHANGES)
-    monkeypatch.setattr(WPT, "clone", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    went_on = []
+
+    def clone(*_):
+        os.kill(os.getpid(), signal.SIGINT)
+        went_on.append(True)
+
+    monkeypatch.setattr(WPT, "clone", clone)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             run(one)
     finally:
         signal.signal(signal.SIGINT, before)
+    assert not went_on
     assert not (one.folder / "0.monitor.csv").read_text().count("\n") > 2
 
 

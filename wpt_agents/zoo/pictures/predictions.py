@@ -26,6 +26,7 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 COMMON = tuple(STYLES)[:6]  # compared on every robot
 OTHERS = ("#d55e00", "#009e73", "#56b4e9", "#e69f00")  # colours of models that the user has named
+DASHES = ("-", ":", "-.", "--")  # of predictors that share a style, as a model and its mean
 CAPTION = (  # of the strips, in lines that fit above a single panel
     "Upper row: what happened. Rows below: what is predicted from\n"
     "the actions alone, after the last image seen. One step is one action."
@@ -89,8 +90,12 @@ def draw_curves(
 
 
 def _panel(axes: Axes, title: str, curves: Sequence[Curve]) -> None:
+    looks: list[dict[str, Any]] = []
     for rank, curve in enumerate(curves):
         look = style(curve.prediction, rank)
+        looks.append(look)
+        if alike := looks.count(look) - 1:
+            look = look | {"ls": DASHES[alike % len(DASHES)]}
         at = np.arange(len(curve.error))[1:]
         axes.plot(at, curve.error[1:], label=curve.prediction, **look)
         axes.fill_between(at, curve.low[1:], curve.high[1:], color=look["color"], alpha=0.13, lw=0)

@@ -21,6 +21,7 @@ import torch
 from rich.markup import escape
 
 from wpt_agents.files.names import counted
+from wpt_agents.training.signals import StopSignals
 from wpt_agents.zoo.collect.workers import end_with_parent
 from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.machine import check_machine, import_extra
@@ -36,8 +37,8 @@ Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called repeatedly while waiting; should be fast
 Errors = dict[Path, str]  # by run folder, of the runs that failed
 STOPPING = (
-    "each run stops after its episode and the updates of it, so that it can continue from there; "
-    "Ctrl-C again stops them at once"
+    "each process saves its work first, a run after its episode and the updates of it; Ctrl-C "
+    "again stops all at once"
 )
 
 
@@ -135,8 +136,9 @@ class Local:
         deaths = Counter[Path]()
         errors = {}
         running: dict[BaseProcess, Run] = {}
-        try:
-            while waiting or running:
+        with StopSignals() as signals, ExitStack() as stack:
+            stack.callback(stop, running)  # the work is saved before a signal takes effect
+            while (waiting or running) and not signals.received:
                 while waiting and len(running) < self.resources.workers:
                     job = waiting.popleft()
                     running[self.start(work, job)] = job
@@ -150,11 +152,6 @@ class Local:
                     elif code:
                         trace = job.shared.log if work is make_shared else trace_of(job.folder)
                         errors[job.folder] = why(trace, code)
-        except KeyboardInterrupt:
-            say("stop", STOPPING)
-            raise
-        finally:
-            stop(running)
         return errors
 
     def start(self, work: Work, job: Run) -> BaseProcess:
@@ -176,6 +173,8 @@ def stop(processes: Collection[BaseProcess]) -> None:
     for process in processes:
         process.terminate()
     try:
+        if processes:
+            say("stop", STOPPING)
         for process in processes:
             process.join()
     except KeyboardInterrupt:

@@ -1,5 +1,7 @@
 """The runner's progress bar with speed and remaining time."""
 
+from contextlib import suppress
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
@@ -34,7 +36,8 @@ class LearningBar(BaseCallback):
     def _on_training_end(self) -> None:
         if self.bar is not None:
             self._move()
-            self.bar.close()
+            with suppress(BrokenPipeError):
+                self.bar.close()
 
     def _move(self) -> None:
         assert self.bar is not None
@@ -42,4 +45,6 @@ class LearningBar(BaseCallback):
         if episodes:
             returns = float(np.mean([episode["r"] for episode in episodes]))
             self.bar.set_postfix({"return": f"{returns:.1f}"}, refresh=False)
-        self.bar.update(self.model.num_timesteps * self.frames_a_step - self.bar.n)
+        # Ctrl-C also ends the program that reads the output, such as `tee`, but not the episode.
+        with suppress(BrokenPipeError):
+            self.bar.update(self.model.num_timesteps * self.frames_a_step - self.bar.n)

@@ -26,7 +26,7 @@ RESULT = Result(
     metric="success",
     scores={
         "nothing": Score((0.0, 0.0), (False, False)),
-        "last": Score((1.0, 2.0), (False, True)),
+        "last": Score((1.0, 2.0), (False, True), (True, True)),
         "best": Score((3.0, 4.0), (True, True)),
     },
     seconds={"learn": 2.5},
@@ -47,6 +47,8 @@ def test_a_result_is_read_back_as_it_was_written(tmp_path):
         RESULT.command,
     )
     assert stored["scores"]["last"]["success_rate"] == 0.5  # for other programs
+    assert stored["scores"]["last"]["success_rate_any"] == 1.0
+    assert stored["scores"]["best"]["success_rate_any"] is None
 
 
 def test_the_best_policy_counts_if_the_run_kept_it():

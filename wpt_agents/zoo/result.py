@@ -112,15 +112,18 @@ class Score:
     """The returns of one policy over seeded episodes.
 
     :param successes: whether each episode ended in success; empty if the task reports none
+    :param successes_any: whether each episode had success at any step; empty in earlier files, too
     """
 
     returns: tuple[float, ...]
     successes: tuple[bool, ...] = ()
+    successes_any: tuple[bool, ...] = ()
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Self:
         """Read a score from a JSON object; values that follow from the episodes are not read."""
-        return cls(tuple(stored["returns"]), tuple(stored["successes"]))
+        successes_any = tuple(stored.get("successes_any", ()))
+        return cls(tuple(stored["returns"]), tuple(stored["successes"]), successes_any)
 
     @property
     def mean(self) -> float:
@@ -136,6 +139,11 @@ class Score:
     def success_rate(self) -> float | None:
         """The share of successful episodes, None if the task reports none."""
         return float(np.mean(self.successes)) if self.successes else None
+
+    @property
+    def success_rate_any(self) -> float | None:
+        """The share of episodes with success at any step, None if that is unknown."""
+        return float(np.mean(self.successes_any)) if self.successes_any else None
 
     def counted(self, metric: Metric) -> float:
         """Return the score's value by a metric: its success rate, or its mean return."""
@@ -262,7 +270,8 @@ def _score_json(score: Score) -> dict[str, Any]:
     """Include derived values, because other programs read these files."""
     mean, low, high = score.interval
     computed = {"mean": mean, "low": low, "high": high, "success_rate": score.success_rate}
-    return {"returns": list(score.returns), "successes": list(score.successes), **computed}
+    computed |= {"success_rate_any": score.success_rate_any}
+    return {**asdict(score), **computed}
 
 
 def _from_json(stored: dict[str, Any]) -> Result:

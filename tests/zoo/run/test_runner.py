@@ -16,6 +16,7 @@ import yaml
 from debug_agent import recorded
 from dot_runs import DOT, dot, job  # noqa: F401  (dot registers the task for each test)
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.results_plotter import load_results, ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from wpt_envs.tasks import TASKS
@@ -343,6 +344,27 @@ def test_evaluation_is_seeded_apart_from_training():
     assert len(set(returns)) == 3
     noise = [evaluate(RandomPolicy(space, 1), DOT.id, env, 2, 5).returns for _ in range(2)]
     assert noise[0] == noise[1]
+
+
+class Passing(toy_env.DotEnv):
+    """A task that is solved at its second step, and then no more."""
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        self.steps = getattr(self, "steps", 0) + 1
+        success = self.steps == 2
+        self.ever = success or getattr(self, "ever", False)
+        return *rest, info | {"is_success": success, "success_any": self.ever}
+
+
+def test_success_at_any_step_is_counted_beside_that_at_the_last(monkeypatch):
+    def watched():
+        return Monitor(Passing())
+
+    monkeypatch.setattr(evaluation, "make_vec_env", lambda *_: DummyVecEnv([watched] * 2))
+    score = evaluate(DoNothing(toy_env.DotEnv().action_space), DOT.id, {}, 2, 5)
+    assert (score.successes, score.successes_any) == ((False,) * 2, (True,) * 2)
+    assert (score.success_rate, score.success_rate_any) == (0.0, 1.0)
 
 
 def test_training_logs_success_where_the_task_counts_it(tmp_path):

@@ -68,7 +68,9 @@ def evaluate_model(
     typer.echo(f"95 % interval    {interval_text(low, high)}")
     typer.echo(f"returns          {', '.join(map(number, score.returns))}")
     if score.successes:
-        typer.echo(f"success          {score.success_rate:.2f}, at the last step")
+        ever = score.success_rate_any
+        at_any_step = "" if ever is None else f"; {ever:.2f} at any step"
+        typer.echo(f"success          {score.success_rate:.2f} at the last step{at_any_step}")
 
 
 def enjoy_model(

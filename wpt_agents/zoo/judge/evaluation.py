@@ -47,6 +47,7 @@ def evaluate(
     """
     returns: list[float] = []
     successes: list[bool] = []
+    successes_any: list[bool] = []
     steps = episode_steps(task, env)
     with progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar:
 
@@ -55,6 +56,8 @@ def evaluate(
             info = local["info"]
             if local["done"] and "is_success" in info:
                 successes.append(bool(info["is_success"]))
+            if local["done"] and "success_any" in info:
+                successes_any.append(bool(info["success_any"]))
 
         for first in range(0, episodes, PARALLEL):
             number = min(PARALLEL, episodes - first)
@@ -64,7 +67,7 @@ def evaluate(
                     policy, wrapped, number, callback=watch, return_episode_rewards=True
                 )
             returns += np.asarray(earned, float).tolist()
-    return Score(tuple(returns), tuple(successes))
+    return Score(tuple(returns), tuple(successes), tuple(successes_any))
 
 
 def acting(policy: PolicyPredictor) -> Act:

@@ -165,7 +165,7 @@ def scores_table(result: Result) -> Table:
     table.add_column("policy")
     headings = ["mean return", "95 % interval", "lowest", "highest"]
     if result.metric == "success":
-        headings.append("success")
+        headings += ["success", "at any step"]
     for heading in headings:
         table.add_column(heading, justify="right")
     for policy, score in result.scores.items():
@@ -173,7 +173,7 @@ def scores_table(result: Result) -> Table:
         cells = [number(mean), interval_text(low, high)]
         cells += [number(min(score.returns)), number(max(score.returns))]
         if result.metric == "success":
-            cells.append(number(score.success_rate))
+            cells += [number(score.success_rate), number(score.success_rate_any)]
         style = "bold" if policy == result.final_policy else None
         table.add_row(policy_title(policy_name(result, policy)), *cells, style=style)
     return table

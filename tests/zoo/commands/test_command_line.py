@@ -154,7 +154,8 @@ def test_a_group_without_a_command_shows_its_help(monkeypatch, capsys):
 def test_ctrl_c_ends_in_one_sentence(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("wpt_agents.zoo.judge.trained.find_trained", fail(KeyboardInterrupt()))
     assert call(monkeypatch, "eval", tmp_path) == 130
-    assert capsys.readouterr().err.count("Interrupted. The same command continues from") == 1
+    sentence = "The same command continues from the finished stages and the last checkpoint."
+    assert capsys.readouterr().err == f"Interrupted. {sentence}\n"
 
 
 def test_ctrl_c_of_a_forced_run_says_that_force_would_begin_again(monkeypatch, capsys):

@@ -99,7 +99,8 @@ def main() -> None:
         if message:  # empty if typer has printed the help of a group such as `data`
             typer.secho(f"Error: {message}", fg="red", err=True)
     if code == INTERRUPTED:
-        again = "without --force" if "--force" in words else "from the finished stages"
+        kept = "from the finished stages and the last checkpoint"
+        again = "without --force" if "--force" in words else kept
         typer.echo(f"Interrupted. The same command continues {again}.", err=True)
     sys.exit(code or 0)
 

@@ -107,6 +107,17 @@ def test_a_dotted_name_never_loads_another_file(tmp_path):
         WPT.load(tmp_path / "model.v2")
 
 
+def test_an_unknown_name_is_refused_with_the_models_that_come_with_the_library(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no model file nothing\.zip, .*metaworld-mid"):
+        WPT.load("nothing")
+
+
+def test_the_folder_in_which_one_is_is_refused_as_any_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"\. is a folder, which holds no model file"):
+        WPT.load(".")
+
+
 def test_a_folder_is_refused_with_the_files_it_holds(tmp_path):
     run = tmp_path / "walker_0"
     run.mkdir()

@@ -235,6 +235,17 @@ def test_npz_episodes_come_by_name_from_every_folder(tmp_path):
     assert [len(t) for t in NpzEpisodes(tmp_path, **SMALL)] == [7, 6, 5]
 
 
+def test_a_file_of_another_format_is_no_npz_and_never_to_be_loaded_as_a_pickle(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 4)))
+    (tmp_path / "a.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    for name in ("a.npy", "a.hdf5"):
+        with pytest.raises(
+            ValueError, match=rf"{name} is .* not an .npz .*; if it is of"
+        ) as refused:
+            NpzEpisodes(tmp_path / name)[0]
+        assert "pickle" not in str(refused.value)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.99])
 def test_a_truncated_npz_is_named(tmp_path, share):
     save_npz(tmp_path / "0.npz", chain(50))

@@ -554,6 +554,24 @@ def test_actions_in_several_arrays_are_put_side_by_side_in_the_order_of_the_keys
     np.testing.assert_array_equal(swapped.action[:, ::-1], old.action[:4])
 
 
+def test_a_wrong_name_of_actions_in_groups_is_refused_with_the_names_of_one_group(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(5, i) for i in range(3)], with_next=False)
+    message = r"in data/demo_0: there is no array 'action' of actions; there are: actions, dones"
+    with pytest.raises(ValueError, match=message):
+        open_episodes(tmp_path / "a.hdf5", action_key="action", **SMALL)
+
+
+def test_unusual_names_of_actions_in_groups_are_asked_for_besides_the_images(tmp_path):
+    old = [chain(5 + i, i) for i in range(3)]
+    names = {f"data/demo_{i}/obs/agentview_image": t.image for i, t in enumerate(old)}
+    names |= {f"data/demo_{i}/joints": t.action for i, t in enumerate(old)}
+    path = save(tmp_path / "a.hdf5", names)
+    with pytest.raises(ValueError, match=r"pass image_key .* pass action_key, .*demo_0/joints"):
+        open_episodes(path, **SMALL)
+    for new, expected in zip(open_episodes(path, action_key="joints", **SMALL), old, strict=True):
+        check(new, expected)
+
+
 def test_a_folder_of_hdf5_files_is_read_in_numeric_order(tmp_path):
     for i in (0, 2, 10):
         old = [chain(5 + i, i)]

@@ -34,8 +34,12 @@ def test_lists_and_tensors_are_taken_as_arrays():
 
 @pytest.mark.parametrize(
     "make",
-    [lambda image: image.transpose(0, 3, 1, 2), lambda image: image / np.float32(255)],
-    ids=["channels first", "floats"],
+    [
+        lambda image: image.transpose(0, 3, 1, 2),
+        lambda image: image / np.float32(255),
+        lambda image: image.astype(np.float32),
+    ],
+    ids=["channels first", "floats", "bytes as floats"],
 )
 def test_the_remedy_for_images_of_another_form_works(make):
     old = chain(3)

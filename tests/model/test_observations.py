@@ -42,6 +42,13 @@ def test_floats_are_refused_with_their_range():
         to_images(np.eye(64)[..., None] * np.ones(3))
 
 
+def test_the_whole_result_of_reset_is_refused_with_the_line_that_helps():
+    image = np.zeros((64, 64, 3), np.uint8)
+    with pytest.raises(ValueError, match=r"as Gymnasium's reset .* `obs, info = env.reset\(\)`"):
+        to_images((image, {}))
+    assert to_images((image, image))[0].shape == (2, 64, 64, 3)  # a tuple of images is a batch
+
+
 @pytest.mark.parametrize("start", [np.ones(3, bool), np.ones((2, 1), bool), [True], True])
 def test_an_episode_start_of_another_length_is_refused(start):
     with pytest.raises(ValueError, match=r"episode_start has the shape .* pass 2 bools"):

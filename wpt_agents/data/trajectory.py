@@ -67,7 +67,9 @@ class Trajectory:
         if image.ndim != 4 or image.shape[-1] != 3 or image.dtype != np.uint8:
             remedy = ""
             if image.ndim == 4 and image.dtype.kind == "f":
-                remedy = "; np.rint(255 * image).astype(np.uint8) if 1 is white"
+                white = 255 if (image > 1).any() else 1
+                scaled = "image" if white == 255 else "255 * image"
+                remedy = f"; np.rint({scaled}).astype(np.uint8) if {white} is white"
             elif image.ndim == 4 and image.shape[1] == 3:
                 remedy = "; image.transpose(0, 2, 3, 1)"
             raise ValueError(

@@ -48,8 +48,16 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
     transparency) is left out, and other sizes are resized.
 
     :param image_key: the entry to take from a dictionary; its only image if None
-    :raises ValueError: anything that is no uint8 image
+    :raises ValueError: anything that is no uint8 image, such as all that `reset` returns
     """
+    if isinstance(observation, tuple) and any(
+        isinstance(part, Mapping) for part in observation[1:]
+    ):
+        raise ValueError(
+            "An observation must be an image, got a tuple that ends with a dictionary, as "
+            "Gymnasium's reset and step return it: take its first entry, for example "
+            "`obs, info = env.reset()`"
+        )
     if isinstance(observation, Mapping):
         observation = observation[_key_of(observation, image_key)]
     observation = np.asarray(observation)

@@ -91,15 +91,22 @@ def find(path: ModelPath) -> ModelPath:
     """Return the path of an existing file, with the suffix that `write` adds where there is none.
 
     :param path: a file, or the name of a shipped model if there is no such file
-    :raises FileNotFoundError: a folder; the message lists the model files in it
+    :raises FileNotFoundError: a folder, or neither a file nor a shipped model; the message lists
+        the model files in the folder, or the shipped models
     """
     if not isinstance(path, str | os.PathLike):
         return path
     path = Path(path)
     if not path.exists() and str(path) in shipped():
         return shipped()[str(path)]
-    file = path if path.suffix else path.with_suffix(".zip")
+    file = path if path.suffix or not path.name else path.with_suffix(".zip")  # "." has no name
     if path.is_dir() and not file.is_file():
         names = ", ".join(sorted(item.name for item in path.glob("*.zip"))) or "no model file"
         raise FileNotFoundError(f"{path} is a folder, which holds {names}: pass the file to load")
+    if not file.exists() and path.parent == Path() and not path.suffix:
+        names = ", ".join(shipped())
+        raise FileNotFoundError(
+            f"There is no model file {file}, nor a model of this name that comes with the library "
+            f"({names}); pass the path that save() wrote, or one of these names"
+        )
     return file

@@ -32,8 +32,8 @@ def find_tasks(suite: str, patterns: Sequence[str]) -> list[Task]:
         ]
         if not matching and elsewhere:
             raise ValueError(
-                f"{name} is of the suite {elsewhere[0]}: write {elsewhere[0]}-{name}, or --suite "
-                f"{elsewhere[0]} where there is such an option"
+                f"{name} is of the suite {elsewhere[0]}: pass --suite {elsewhere[0]}, or write "
+                f"{elsewhere[0]}-{name} where there is no such option"
             )
         if not matching:
             raise unknown_name(f"task in suite {where!r} called", name, rows)

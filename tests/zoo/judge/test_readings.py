@@ -64,8 +64,9 @@ def test_the_largest_difference_is_relative_to_what_was_earned():
     assert largest_difference([Promise(0, 0.0, 0.1, 0, 0, 0)]) == math.inf
 
 
-def test_a_step_that_earns_nothing_has_no_relative_difference(folder):
-    none = Promise(0, 0.0, 0.1, 0, 0, 0)
+@pytest.mark.parametrize("earned", [0.0, 1e-27])
+def test_a_step_that_earns_nothing_has_no_relative_difference(folder, earned):
+    none = Promise(0, earned, 0.1, 0, 0, 0)
     rows = {row.what: (row.value, row.beside) for row in readings(folder, [none], 4, 600)}
     name = "imagined reward of the same actions, largest difference"
     assert rows[name] == ("undefined", "a step earned nothing")

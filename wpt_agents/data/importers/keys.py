@@ -91,7 +91,15 @@ def find_keys(
     :param terminal_key: the flag that marks a terminal state
     :raises ValueError: if they are missing or ambiguous; lists the arrays
     """
-    image, others = _find_images(table, image_key)
+    try:
+        image, others = _find_images(table, image_key)
+    except ValueError as error:
+        # Unusual names of actions hide the episodes' groups, and with them the images.
+        try:
+            find_actions(table, action_keys)
+        except ValueError as missing:
+            raise ValueError(f"{error}. Besides, {missing}") from error
+        raise
     terminal = first(TERMINAL, table) if terminal_key is None else match(terminal_key, table)
     if terminal_key is not None and terminal is None:
         raise ValueError(f"there is no array {terminal_key!r}; there are: {', '.join(table)}")

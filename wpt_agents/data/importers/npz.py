@@ -236,13 +236,21 @@ def names_of(file: Path) -> list[str]:
         with zipfile.ZipFile(file) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
     except FAULTS as error:
-        raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error
+        raise _unreadable(file, error) from error
 
 
 def arrays_of(file: Path, names: set[str]) -> dict[str, np.ndarray]:
     """Load some arrays of a file."""
+    if not zipfile.is_zipfile(file):  # np.load reads other files, too, or takes them for pickles
+        raise _unreadable(file, "it is not a zip archive")
     try:
         with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files if name in names}
     except FAULTS as error:
-        raise ValueError(f"{file} is damaged or not an .npz of arrays: {error}") from error
+        raise _unreadable(file, error) from error
+
+
+def _unreadable(file: Path, fault: object) -> ValueError:
+    """Return the error for a file that is no `.npz` archive, or a damaged one."""
+    known = "" if file.suffix == ".npz" else "; if it is of another format, name that, or auto"
+    return ValueError(f"{file} is damaged or not an .npz of arrays: {fault}{known}")

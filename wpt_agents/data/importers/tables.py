@@ -18,6 +18,7 @@ from wpt_agents.data.importers.keys import (
     count,
     find_keys,
     first,
+    match,
     within,
 )
 from wpt_agents.data.trajectory import Trajectory
@@ -107,6 +108,8 @@ class TableEpisodes(Episodes):
         table = self._table(file)
         task = self._task(file)
         groups, idle = by_group(table, self.action_keys)
+        if not groups and any(match(key, table) is None for key in self.action_keys):
+            groups, idle = by_group(table, ())  # the error then names the group's arrays
         if idle:
             warnings.warn(
                 f"{file}: {len(idle)} groups of images without actions are left out, {idle[0]} for "

@@ -23,6 +23,7 @@ from wpt_agents.zoo.terminal import console
 
 STEP, UPDATES = "time/total_timesteps", "train/updates"
 REWARD_ERROR, ENTROPY = "train/heldout_reward_error", "train/entropy"
+NOTHING = 1e-6  # reward per step
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,12 @@ def narrowest_entropy(actions: int) -> float:
 
 
 def largest_difference(promised: Sequence[Promise]) -> float:
-    """Return the largest `|imagined - earned| / |earned|` for the actions that were executed."""
+    """Return the largest `|imagined - earned| / |earned|` for the actions that were executed.
+
+    It is infinite if the reward of a step is practically 0, as Meta-World's is far from the goal.
+    """
     return max(
-        abs(p.same_actions - p.earned) / abs(p.earned) if p.earned else float("inf")
+        abs(p.same_actions - p.earned) / abs(p.earned) if abs(p.earned) > NOTHING else math.inf
         for p in promised
     )
 

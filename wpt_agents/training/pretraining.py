@@ -238,7 +238,8 @@ def whole_update(learner: WorldModelLearner, streams: Streams) -> Update:
 
     def update(batch: Batch, step: int) -> Metrics:
         generator = streams.torch(Purpose.PRETRAIN, step, device)
-        return learner.update_world_model(batch.to(device), generator)[1]
+        _, _, metrics = learner.update_world_model(batch.to(device), generator)
+        return metrics
 
     return update
 

@@ -373,5 +373,6 @@ class SavedAgent(KeywordAgent):
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""
         left_out = {"env", "_vec_normalize_env", "_last_obs", "_resets_seen", "rollout"}
+        left_out |= {"after_update"}  # a callback's
         state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
         return state | {"_custom_logger": False}

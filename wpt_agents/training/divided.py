@@ -17,42 +17,33 @@ from wpt_agents.model.distributions import Share, kl_one_hot
 from wpt_agents.model.layers import frozen
 from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_update_loss
 from wpt_agents.training.distributed import World
+from wpt_agents.training.world_model_learner import WorldModelLearner
 
 
 class Divided:
     """Eq. (1) on batches that are divided over processes, and in each over several passes.
 
-    :param model: every process's copy; they become equal
+    :param learner: whose world model learns; the copies of all processes become equal
     :param passes: over each process's share, to save memory
-    :param batch_size: rows of the whole batch
-    :param autocast: what a forward pass runs in
-    :param options: `Learner.eq_1_options`
     :raises ValueError: a batch that cannot be divided so
     """
 
-    def __init__(
-        self,
-        model: WorldModel,
-        world: World,
-        passes: int,
-        batch_size: int,
-        autocast: Callable[[], AbstractContextManager[None]],
-        options: dict[str, Any],
-    ) -> None:
+    def __init__(self, learner: WorldModelLearner, world: World, passes: int) -> None:
+        batch_size = learner.hyperparameters.batch_size
         if passes < 1 or batch_size % (world.size * passes):
             raise ValueError(
                 f"batch_size={batch_size} cannot be divided over {world.size} processes of "
                 f"accumulate={passes} passes each: it must be a multiple of their product"
             )
-        self.model = model
+        self.model = learner.policy.world_model
         self.world = world
         self.passes = passes
         self.batch_size = batch_size
-        self.autocast = autocast
-        self.options = options
-        self.objective: nn.Module = _Objective(model, options)
+        self.autocast = learner.autocast
+        self.options = learner.eq_1_options
+        self.objective: nn.Module = _Objective(self.model, self.options)
         if world.size > 1:
-            with frozen(*model.heads):  # DDP waits for the gradients of all else
+            with frozen(*self.model.heads):  # DDP waits for the gradients of all else
                 self.objective = DistributedDataParallel(self.objective)
 
     def backward(self, share: Batch, device: torch.device, seed: int) -> WorldModelLoss:

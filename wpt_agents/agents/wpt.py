@@ -283,9 +283,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.learner.set_actor_critic_rate(max(left, 0.0))
         batch = self.mixed_batch()
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
-        schedule = progress.num_timesteps, self.imitation_weight(), head_start
         with self.operations():
-            update = self.learner.update(batch, generator, *schedule)
+            update = self.learner.update(
+                batch, generator, progress.num_timesteps, self.imitation_weight(), head_start
+            )
         for name, value in update.items():
             metrics[name].append(value)
         self.policy.average(self.averaging())

@@ -52,6 +52,10 @@ class Learner(WorldModelLearner):
         learner = Learner(policy, Hyperparameters(size="tiny"))
         metrics = learner.update(batch, generator)
 
+    Keywords add losses to those of the paper: `reward_grad` and `imitation_grad` to the world
+    model's, `kickstart` to the actor's, `repval_scale` and `slow_critic_scale` to the critic's. The
+    networks that `reward_ensemble`, `continue_head` and `residual` add have losses of their own.
+
     :param policy: whose networks learn
     :param hyperparameters: rates, weights and clips
     """

@@ -18,6 +18,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -86,7 +87,7 @@ def learnt(
     return model, updated(model)
 
 
-def pretraining(**options: object) -> tuple[WPT, dict[str, torch.Tensor]]:
+def pretraining(**options: Any) -> tuple[WPT, dict[str, torch.Tensor]]:
     """Pre-train for 20 updates; return the losses of each."""
     metrics: dict[str, list[torch.Tensor]] = defaultdict(list)
 
@@ -98,7 +99,7 @@ def pretraining(**options: object) -> tuple[WPT, dict[str, torch.Tensor]]:
     return model, {name: torch.stack(values) for name, values in metrics.items()}
 
 
-def explored(name: str, **changes: object) -> tuple[WPT, dict[str, torch.Tensor]]:
+def explored(name: str, **changes: Any) -> tuple[WPT, dict[str, torch.Tensor]]:
     """Explore for two episodes, then make 20 updates."""
     settings = SETTINGS | {"offline_ratio": 0.0, "guidance": 0.0} | changes
     model = EXPLORERS[name]("WPTPolicy", ClockEnv(), **settings)

@@ -2,7 +2,6 @@
 
 import copy
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -162,8 +161,7 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
     dream = model.policy.dream(Latent(*state), 4, generator())
     ensemble = model.policy.curiosity
     ensemble.scale.see(torch.tensor(1.0))
-    model.learner.paid = SimpleNamespace(reward=torch.arange(-1.0, 5.0))
-    reward = model.learner.imagined_reward(dream, torch.arange(1, 6))
+    reward = model.learner.worth(dream, torch.arange(5.0)).reward
     assert reward.shape == (5, 4) and (reward[:, 1:] > 0).all()
     assert reward[:, 0].tolist() == [0, 1, 2, 3, 4]
     step = disagreement(ensemble(dream.states.feat[:, 1], dream.action[:, 1]))
@@ -175,12 +173,13 @@ def test_the_imagined_reward_is_paid_for_the_step_before_and_teaches_the_actor_o
 
 
 def test_a_replayed_state_is_paid_for_the_real_step_that_led_to_it():
-    model, batch = explorer(Plan2Explore), batch_of(recorded(8), recorded(8, seed=1))
+    model = explorer(Plan2Explore, imagine_starts=0)
+    batch = batch_of(recorded(8), recorded(8, seed=1))
     batch.is_first[0, 4] = True  # an episode's edge
     ensemble = copy.deepcopy(model.policy.curiosity)  # a copy from before the update
-    post, _ = model.learner.update_world_model(batch, generator())
-    dream = model.policy.dream(post.flatten_time(), 2, generator())
-    paid = model.learner.imagined_reward(dream, torch.arange(18))[:, 0].view(2, 9)
+    post, paid_batch, _ = model.learner.update_world_model(batch, generator())
+    _, worth = model.learner.dream(post, paid_batch, generator(), 0, False)
+    paid = worth.reward[:, 0].view(2, 9)
     surprise = disagreement(ensemble(post.feat[:, :-1], batch.action[:, 1:]))
     within = ~batch.is_first[:, 1:]
     expected = surprise * within / surprise[within].mean()  # the first mean counts in full

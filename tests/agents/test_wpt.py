@@ -543,16 +543,22 @@ def test_an_average_that_is_switched_off_acts_no_longer(tmp_path):
 def test_dreams_start_from_as_many_states_as_the_keyword_says(number, states, monkeypatch):
     model, seen = agent(batch_size=4, batch_length=6, imagine_starts=number), []
     model.replay_buffer.add(recorded(length=20, reward=np.zeros(20)))
-    update_behavior = model.learner.update_behavior
+    draw_starts = model.learner.draw_starts
 
-    def noted(start, starts, *args):
-        seen.append((len(start.deter), starts))
-        return update_behavior(start, starts, *args)
+    def noted(*args):
+        seen.append(draw_starts(*args))
+        return seen[-1]
 
-    monkeypatch.setattr(model.learner, "update_behavior", noted)
+    def dreamt(start, *args):
+        seen.append(start)
+        return dream(start, *args)
+
+    dream = model.policy.dream
+    monkeypatch.setattr(model.learner, "draw_starts", noted)
+    monkeypatch.setattr(model.policy, "dream", dreamt)
     model.update(defaultdict(list))
-    [(imagined, starts)] = seen
-    assert imagined == len(starts) == states
+    starts, start = seen
+    assert len(start.deter) == len(starts) == states
     assert (starts % 6).min() >= (0 if number is None else 2)  # which have seen three images
 
 

@@ -168,7 +168,7 @@ EXAMPLES = {
     "shifted_by_cuts": shifts,
     "acting_step_with_copies": acting,
     "compiled_filter_step": compiled_step,
-    "compiled_imagine": compiled_dream,
+    "compiled_dream": compiled_dream,
 }
 
 

@@ -316,12 +316,12 @@ def test_reinforce_casts_weights_anew_after_its_dreams_without_gradient(monkeypa
         called.append(name)
         return plain(*args)
 
-    for name in ("autocast", "imagine", "actor_loss"):
+    for name in ("autocast", "worth", "actor_loss"):
         plain = getattr(learner, name)
         monkeypatch.setattr(learner, name, partial(noted, name, plain))
     model.update(defaultdict(list))
-    dreams = called.index("imagine")
-    assert called[dreams : dreams + 3] == ["imagine", "autocast", "actor_loss"]
+    dreams = called.index("worth")
+    assert called[dreams : dreams + 3] == ["worth", "autocast", "actor_loss"]
 
 
 def test_rewards_teach_the_reward_head_and_leave_the_world_model_alone():
@@ -394,9 +394,7 @@ def test_the_entropys_weight_goes_by_its_schedule(actor_grad):
         metrics = defaultdict(list)
         model.update(metrics)
         losses[ent_coef] = metrics["train/actor_loss"][0]
-        model.num_timesteps = 1000
-        model.update(metrics)
-        assert model.hyperparameters.ent_coef_at(model.learner.step) == (
+        assert model.hyperparameters.ent_coef_at(1000) == (
             0.5 if ent_coef == 0.5 else pytest.approx(0.2)
         )
     assert losses["linear(0.8,0.2,100)"] == losses[0.5]
@@ -437,10 +435,11 @@ def test_reinforce_teaches_the_actor_alone_and_by_its_own_formula(ends):
     start = policy.world_model.rssm.initial(6)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        imagined = learner.imagine(start, torch.arange(6), generator)
-    dream, reward, value, returns, _ = imagined
+        dream = policy.dream(start, model.imagine_horizon, generator)
+        worth = learner.worth(dream, torch.zeros(6))
+    reward, value, returns, _ = worth
     goes_on = torch.rand(returns.shape, generator=generator) if ends else None
-    loss = learner.actor_loss(imagined._replace(goes_on=goes_on), torch.tensor(2.0))
+    loss = learner.actor_loss(dream, worth._replace(goes_on=goes_on), torch.tensor(2.0))
     going = torch.ones_like(returns) if goes_on is None else goes_on
     expected = 0.0
     for n in range(6):
@@ -471,12 +470,13 @@ def test_the_slow_critic_regulariser_pulls_the_critic_to_the_target_critic(scale
 
     monkeypatch.setattr(learner, "descend", recorded)
     with torch.no_grad():
-        imagined = learner.imagine(start, torch.arange(6), torch.Generator().manual_seed(0))
-        logits = policy.critic(imagined.dream.states.but_last().feat)
+        dream = policy.dream(start, model.imagine_horizon, torch.Generator().manual_seed(0))
+        worth = learner.worth(dream, torch.zeros(6))
+        logits = policy.critic(dream.states.but_last().feat)
         weight = 0.9 ** torch.arange(logits.shape[1])
-        expected = (weight * two_hot_loss(logits, imagined.returns)).mean()
-        pull = (weight * two_hot_loss(logits, imagined.value[:, :-1])).mean()
-    learner.update_behavior(start, torch.arange(6), torch.Generator().manual_seed(0))
+        expected = (weight * two_hot_loss(logits, worth.returns)).mean()
+        pull = (weight * two_hot_loss(logits, worth.value[:, :-1])).mean()
+    learner.update_critic(dream, worth)
     torch.testing.assert_close(losses["critic"], expected + scale * pull)
 
 
@@ -505,7 +505,7 @@ def test_the_replay_value_loss_takes_sequences_of_one_image():
 def test_the_replay_value_loss_is_that_of_the_replayed_rewards():
     model = filled(repval_scale=0.3, gamma=0.5, lam=1.0)
     batch = mix(model.replay_buffer, None, 0, 2, 4, model.max_action_dim, np.random.default_rng(0))
-    post, _ = model.learner.update_world_model(batch, torch.Generator().manual_seed(0))
+    post, *_ = model.learner.update_world_model(batch, torch.Generator().manual_seed(0))
     loss = model.learner.replay_value_loss(post, batch)
     policy = model.policy
     with torch.no_grad():

@@ -171,10 +171,8 @@ def test_a_head_that_is_switched_off_is_neither_trained_nor_used(tmp_path):
     before, metrics = weights(model, HEAD), defaultdict(list)
     model.update(metrics)
     assert before and same(before, weights(model, HEAD)) and "train/continue_loss" not in metrics
-    imagined = model.learner.imagine(
-        model.policy.world_model.rssm.initial(2), torch.arange(2), torch.Generator()
-    )
-    assert imagined.goes_on is None
+    dream = model.policy.dream(model.policy.world_model.rssm.initial(2), 3, torch.Generator())
+    assert model.learner.worth(dream, torch.zeros(2)).goes_on is None
 
 
 def test_parameters_with_and_without_the_head_can_be_put_in(tmp_path):

@@ -81,8 +81,7 @@ def test_dreams_are_paid_by_the_schedule_of_the_pessimism():
     dream = policy.dream(start, 3, torch.Generator().manual_seed(0))
     rewards = policy.world_model.rewards(dream.states.but_last().feat)
     for step, beta in ((0, 2.0), (50, 1.0), (100, 0.0)):
-        learner.step = step
-        paid = learner.imagined_reward(dream, torch.arange(6))
+        paid = learner.worth(dream, torch.zeros(6), step).reward
         expected = rewards.mean(-1) - beta * rewards.std(-1, correction=0)
         torch.testing.assert_close(paid, expected, rtol=1e-4, atol=1e-5)
 
@@ -96,8 +95,8 @@ def test_the_pessimism_reaches_the_actor_through_the_deviation():
             torch.nn.init.normal_(head.layers[-1].weight, generator=torch.Generator())
         start = model.policy.world_model.rssm.initial(6)
         generator = torch.Generator().manual_seed(0)
-        imagined = model.learner.imagine(start, torch.arange(6), generator)
-        imagined.reward.sum().backward()
+        dream = model.policy.dream(start, 3, generator)
+        model.learner.worth(dream, torch.zeros(6)).reward.sum().backward()
         gradients.append([p.grad for p in model.policy.actor.parameters() if p.grad is not None])
         assert not [p for p in model.policy.world_model.parameters() if p.grad is not None]
     assert gradients[0] and not all(map(torch.allclose, *gradients))

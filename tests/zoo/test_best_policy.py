@@ -94,4 +94,4 @@ def test_the_end_of_the_head_start_is_saved_before_the_first_update_of_imaginati
     model.learn(14, callback=HeadStart(tmp_path))
     assert model.task_updates == 7  # the head start, and at once all that were earned
     assert WPT.load(tmp_path / HEAD_START_MODEL).task_updates == 3
-    assert "update" not in vars(model)
+    assert model.after_update is None

@@ -24,7 +24,7 @@ import sys
 import time
 from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import ClassVar, Self
@@ -54,6 +54,8 @@ class PixelAgent(SavedAgent):
     """The base of agents that act on images and learn from stored episodes, with SB3's methods."""
 
     warmup_pays: ClassVar[bool] = False  # whether steps before `learning_starts` earn updates
+    # Called after each update of `learn`: SB3 calls no callback there.
+    after_update: Callable[[], None] | None = None
 
     # What a subclass must provide, besides `make_policy` and `make_learner`
 
@@ -292,6 +294,8 @@ class PixelAgent(SavedAgent):
         metrics: Metrics = defaultdict(list)
         for left in reversed(range(updates)):
             self.update(metrics)
+            if self.after_update is not None:
+                self.after_update()
             self.credit = rest + left * price  # so that an interruption costs no updates
         for key, values in metrics.items():
             self.logger.record_mean(key, torch.stack(values).mean().item())

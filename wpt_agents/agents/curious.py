@@ -55,8 +55,6 @@ EXPLORE: Mapping[str, Any] = {
 class CuriousLearner(Learner):
     """A learner whose reward is curiosity; `policy.curiosity` is one more network to train."""
 
-    paid: Batch  # the batch of the present update, with curiosity in place of the task's rewards
-
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
         super().__init__(policy, hyperparameters)
         assert isinstance(policy.curiosity, nn.Module)
@@ -68,10 +66,6 @@ class CuriousLearner(Learner):
         super().configure(hyperparameters)
         self.set_rate(self.curiosity_optimizer, self.model_rate)
 
-    def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
-        """DreamerV3's replay value loss, on returns of curiosity: the critic's value is theirs."""
-        return super().replay_value_loss(post, self.paid)
-
 
 class ICMLearner(CuriousLearner):
     """The reward head learns the forward model's error on real transitions."""
@@ -82,7 +76,7 @@ class ICMLearner(CuriousLearner):
         generator: Generator,
         learn_reward: bool = False,
         states_loss: StatesLoss | None = None,
-    ) -> tuple[Latent, Metrics]:
+    ) -> tuple[Latent, Batch, Metrics]:
         """Train the curiosity on a batch, then the world model with surprise as the reward."""
         icm = self.policy.curiosity
         assert isinstance(icm, ICM)
@@ -97,9 +91,11 @@ class ICMLearner(CuriousLearner):
         known = torch.zeros_like(batch.is_first)
         reward[:, 1:] = icm.scale(surprise.detach())
         known[:, 1:] = within
-        batch = self.paid = replace(batch, reward=reward, reward_known=known)
-        post, metrics = super().update_world_model(batch, generator, learn_reward, states_loss)
-        return post, metrics | {"explore/surprise": surprise.detach().mean()}
+        batch = replace(batch, reward=reward, reward_known=known)
+        post, paid, metrics = super().update_world_model(
+            batch, generator, learn_reward, states_loss
+        )
+        return post, paid, metrics | {"explore/surprise": surprise.detach().mean()}
 
 
 class Plan2ExploreLearner(CuriousLearner):
@@ -110,17 +106,15 @@ class Plan2ExploreLearner(CuriousLearner):
     critic's value means the same everywhere. The first state of a replayed sequence has reward 0.
     """
 
-    arrival: Tensor  # (B*T,), the rewards of the replayed states, where imagination starts
-
     def update_world_model(
         self,
         batch: Batch,
         generator: Generator,
         learn_reward: bool = False,
         states_loss: StatesLoss | None = None,
-    ) -> tuple[Latent, Metrics]:
+    ) -> tuple[Latent, Batch, Metrics]:
         """Train the world model without the task's reward, then the ensemble on its states."""
-        post, metrics = super().update_world_model(batch, generator, states_loss=states_loss)
+        post, _, metrics = super().update_world_model(batch, generator, states_loss=states_loss)
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         within = ~batch.is_first[:, 1:]
@@ -136,17 +130,16 @@ class Plan2ExploreLearner(CuriousLearner):
         known = torch.zeros_like(batch.is_first)
         reward[:, 1:] = ensemble.scale(surprise) * within
         known[:, 1:] = within
-        self.paid = replace(batch, reward=reward, reward_known=known)
-        return post, metrics | {"explore/surprise": surprise[within].mean()}
+        paid = replace(batch, reward=reward, reward_known=known)
+        return post, paid, metrics | {"explore/surprise": surprise[within].mean()}
 
-    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, arrival: Tensor, step: int) -> Tensor:
         """Return the disagreement of the ensemble on imagined steps, (N, H)."""
         ensemble = self.policy.curiosity
         assert isinstance(ensemble, Ensemble)
         feat = dream.states.feat
         with frozen(ensemble):
             surprise = ensemble.scale(disagreement(ensemble(feat[:, :-2], dream.action[:, :-1])))
-        arrival = self.paid.reward.flatten()[index]
         assert len(arrival) == len(surprise), (arrival.shape, surprise.shape)
         return torch.cat([arrival[:, None], surprise], 1)
 

@@ -1,21 +1,23 @@
 """The base of all agents: keywords, random numbers, environment, model files and copies."""
 
+import inspect
 import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, unwrap_vec_normalize
 from torch import Tensor
 
-from wpt_agents.agents.attributes import KeywordAgent
+from wpt_agents.agents.attributes import declare
 from wpt_agents.data.convert import Data, open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
@@ -26,15 +28,19 @@ from wpt_agents.model.observations import IMAGE_SPACE
 from wpt_agents.training import model_files
 from wpt_agents.training.checks import check_device
 from wpt_agents.training.environments import as_vec_env
-from wpt_agents.training.keywords import Stage
+from wpt_agents.training.keywords import Keywords, Stage
+from wpt_agents.training.progress import Progress
 from wpt_agents.training.randomness import Streams, torch_seed
 from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
 
 
-class SavedAgent(KeywordAgent):
+class SavedAgent(BaseAlgorithm):
     """An SB3 algorithm that is made of a policy, a learner, keywords and counters.
+
+    Keywords are `hyperparameters` and counters are `progress`; both are also attributes. A subclass
+    names their classes: `class DrQv2(PixelAgent, keywords=DrQv2Keywords)`.
 
     :param policy: the policy's name or class; the first of `policy_aliases` if None
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
@@ -45,15 +51,40 @@ class SavedAgent(KeywordAgent):
     :param device: "auto", "cpu", "cuda", ...
     """
 
+    keywords: ClassVar[type[Keywords]] = Keywords
+    progress_class: ClassVar[type[Progress]] = Progress
     saved_as: ClassVar[str] = ""  # the class that reads the model files, if not the class itself
     shape_keywords: ClassVar[tuple[str, ...]] = ()  # must be equal where weights are loaded
 
     policy: Any  # a BasePolicy with the methods of `training.rollout.Acting`
     learner: Any
+    hyperparameters: Any  # of the class `keywords`
+    progress: Any  # of the class `progress_class`
+    streams: Streams
+    # Counters of `progress`.
+    num_timesteps: int
+    episodes: int
+    updates: int
+    credit: float
     action_space: spaces.Box
     _last_obs: Any  # SB3's own type does not take all that a VecEnv returns
     _last_episode_starts: Any
     _resets_seen: int | None = None  # when the agent last used its environment
+
+    if TYPE_CHECKING:  # keywords are attributes
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def __init_subclass__(
+        cls,
+        keywords: type[Keywords] | None = None,
+        progress: type[Progress] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.keywords = keywords or cls.keywords
+        cls.progress_class = progress or cls.progress_class
+        declare(cls, cls.keywords, cls.progress_class, cls.__init__)
 
     def __init__(
         self,
@@ -101,6 +132,12 @@ class SavedAgent(KeywordAgent):
         if wrapped is not None:
             self._use_env(wrapped)
 
+    def __repr__(self) -> str:
+        """The keywords that differ from their defaults, those that the size decides, and counts."""
+        chosen = ", ".join(f"{k}={v!r}" for k, v in self.hyperparameters.chosen().items())
+        counted = f"num_timesteps={self.num_timesteps}, updates={self.updates}"
+        return f"<{type(self).__name__}({chosen}), {counted}>"
+
     def _setup_model(self) -> None:
         self.set_random_seed(self.hyperparameters.seed)
         self.policy = self.make_policy().to(self.device)
@@ -131,6 +168,61 @@ class SavedAgent(KeywordAgent):
     def on_other_actions(self) -> None:
         """Adapt to an environment whose actions have another width than those before."""
         self.reset_task()
+
+    # Keywords
+
+    @classmethod
+    def check_keywords(cls, kwargs: Mapping[str, Any]) -> None:
+        """Refuse keywords that the constructor does not have, with the nearest ones."""
+        valid = set(inspect.signature(cls).parameters) - {"_init_setup_model"}
+        for name in kwargs:
+            if name not in valid:
+                raise unknown_name("keyword", name, valid)
+
+    def change_hyperparameter(self, name: str, value: Any) -> None:
+        """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
+
+        :raises ValueError: a value that is not allowed, or one that can no longer take effect
+        """
+        before = self.hyperparameters
+        changed = before.changed(**{name: value})
+        if changed == before:
+            return
+        if remedy := self.too_late(self.keywords.declared()[name].stage):
+            raise ValueError(f"{name}={value!r} can no longer take effect: {remedy}")
+        self.hyperparameters = changed
+        try:
+            if name == "image_key":
+                self._show_entry()
+            self.hyperparameters_changed()
+        except ValueError:
+            self.hyperparameters = before
+            self.policy.image_key = before.image_key
+            raise
+        if name == "seed":
+            self.set_random_seed(changed.seed)
+
+    def _show_entry(self) -> None:
+        """See the entry `image_key` of observations: the environment shows the former one alone."""
+        self.policy.image_key = self.hyperparameters.image_key
+        if self.env is not None:
+            self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)
+
+    def too_late(self, stage: Stage) -> str | None:
+        """Return the remedy if keywords of this stage can no longer take effect, else None."""
+        if stage in (Stage.SIZE, Stage.DRAWING):
+            return f"the networks are made; make a new {type(self).__name__} with it"
+        return None
+
+    def hyperparameters_changed(self) -> None:
+        """Bring what was made from `self.hyperparameters` up to date; ValueError refuses them."""
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed everything that is drawn from now on, and the environment's next reset."""
+        if seed is not None:
+            self.hyperparameters = self.hyperparameters.changed(seed=seed)
+            self.streams = Streams(seed)
+        super().set_random_seed(seed)
 
     # Data and environments
 
@@ -167,25 +259,6 @@ class SavedAgent(KeywordAgent):
         wrapped = as_vec_env(env, self.hyperparameters.image_key)
         self.check_env(wrapped)
         return wrapped
-
-    def change_hyperparameter(self, name: str, value: Any) -> None:
-        """Set a keyword, as `model.gamma = 0.98` does. It takes effect at once and is saved.
-
-        :raises ValueError: a value that is not allowed, or one that can no longer take effect
-        """
-        before = self.hyperparameters.image_key
-        super().change_hyperparameter(name, value)
-        if name != "image_key" or value == before:
-            return
-        self.policy.image_key = value
-        if self.env is None:
-            return
-        try:  # the environment shows the former entry alone
-            self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)
-        except ValueError:
-            super().change_hyperparameter(name, before)
-            self.policy.image_key = before
-            raise
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Use another environment, with any number of copies.
@@ -373,5 +446,6 @@ class SavedAgent(KeywordAgent):
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies and pickles hold: all but environment, open episodes and logger."""
         left_out = {"env", "_vec_normalize_env", "_last_obs", "_resets_seen", "rollout"}
+        left_out |= {"after_update"}  # a callback's
         state = {k: None if k in left_out else v for k, v in vars(self).items() if k != "_logger"}
         return state | {"_custom_logger": False}

@@ -281,11 +281,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         if settings.actor_critic_decay:
             left = 1 - progress.num_timesteps / max(self._total_timesteps, 1)
             self.learner.set_actor_critic_rate(max(left, 0.0))
-        self.learner.step = progress.num_timesteps
         batch = self.mixed_batch()
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
-            update = self.learner.update(batch, generator, self.imitation_weight(), head_start)
+            update = self.learner.update(
+                batch, generator, progress.num_timesteps, self.imitation_weight(), head_start
+            )
         for name, value in update.items():
             metrics[name].append(value)
         self.policy.average(self.averaging())

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from wpt_agents.model.distributions import Drawn, Noise, exponential, uniform
-from wpt_agents.model.policy import Dream, WPTPolicy, imagine
+from wpt_agents.model.policy import Dream, WPTPolicy, dream
 from wpt_agents.model.rssm import RSSM, Latent, filter_step
 
 Step = Callable[..., tuple[Latent, Tensor]]
@@ -45,7 +45,7 @@ def _step(
 
 
 def _dream(policy: WPTPolicy, start: Latent, horizon: int, draws: list[Tensor]) -> Dream:
-    return imagine.definition(policy, start, horizon, Drawn(draws))
+    return dream.definition(policy, start, horizon, Drawn(draws))
 
 
 def step_is_compiled(
@@ -93,11 +93,11 @@ def dream_is_compiled(
     return policy in _dreams
 
 
-@imagine.faster(when=dream_is_compiled)
-def compiled_imagine(
+@dream.faster(when=dream_is_compiled)
+def compiled_dream(
     policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None
 ) -> Dream:
-    """`imagine`, compiled."""
+    """`dream`, compiled."""
     action = start.stoch.new_empty(len(start.stoch), policy.max_action_dim, dtype=torch.float32)
     code = torch.empty_like(start.stoch, dtype=torch.float32)
     draws = []

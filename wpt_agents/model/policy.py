@@ -235,7 +235,7 @@ class WPTPolicy(PixelPolicy):
         :param horizon: H
         """
         with frozen(self.world_model):
-            return imagine(self, start.detach(), horizon, generator)
+            return dream(self, start.detach(), horizon, generator)
 
     @torch.no_grad()
     def embed(self, image: np.ndarray) -> np.ndarray:
@@ -314,7 +314,7 @@ def acting_step(
 
 
 @op
-def imagine(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None) -> Dream:
+def dream(policy: WPTPolicy, start: Latent, horizon: int, generator: Noise = None) -> Dream:
     """Imagine `horizon` steps with the actor, from N states (N, ...)."""
     entropies: list[Tensor] = []
     saturated: list[Tensor] = []

@@ -15,44 +15,35 @@ from torch.nn.parallel import DistributedDataParallel
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.distributions import Share, kl_one_hot
 from wpt_agents.model.layers import frozen
-from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_loss
+from wpt_agents.model.world_model import WorldModel, WorldModelLoss, world_model_update_loss
 from wpt_agents.training.distributed import World
+from wpt_agents.training.world_model_learner import WorldModelLearner
 
 
 class Divided:
     """Eq. (1) on batches that are divided over processes, and in each over several passes.
 
-    :param model: every process's copy; they become equal
+    :param learner: whose world model learns; the copies of all processes become equal
     :param passes: over each process's share, to save memory
-    :param batch_size: rows of the whole batch
-    :param autocast: what a forward pass runs in
-    :param options: `Learner.eq_1_options`
     :raises ValueError: a batch that cannot be divided so
     """
 
-    def __init__(
-        self,
-        model: WorldModel,
-        world: World,
-        passes: int,
-        batch_size: int,
-        autocast: Callable[[], AbstractContextManager[None]],
-        options: dict[str, Any],
-    ) -> None:
+    def __init__(self, learner: WorldModelLearner, world: World, passes: int) -> None:
+        batch_size = learner.hyperparameters.batch_size
         if passes < 1 or batch_size % (world.size * passes):
             raise ValueError(
                 f"batch_size={batch_size} cannot be divided over {world.size} processes of "
                 f"accumulate={passes} passes each: it must be a multiple of their product"
             )
-        self.model = model
+        self.model = learner.policy.world_model
         self.world = world
         self.passes = passes
         self.batch_size = batch_size
-        self.autocast = autocast
-        self.options = options
-        self.objective: nn.Module = _Objective(model, options)
+        self.autocast = learner.autocast
+        self.options = learner.eq_1_options
+        self.objective: nn.Module = _Objective(self.model, self.options)
         if world.size > 1:
-            with frozen(*model.heads):  # DDP waits for the gradients of all else
+            with frozen(*self.model.heads):  # DDP waits for the gradients of all else
                 self.objective = DistributedDataParallel(self.objective)
 
     def backward(self, share: Batch, device: torch.device, seed: int) -> WorldModelLoss:
@@ -114,20 +105,20 @@ class _Objective(nn.Module):
     def forward(
         self, batch: Batch, draws: Share, whole: Callable[[Tensor], Tensor]
     ) -> WorldModelLoss:
-        post, post_logits, prior_logits = self.model.observe(batch, draws)
-        options = dict(self.options)
-        error = self.model.batch_error(post, batch, options.pop("pixel_weight"))
-        if options["free_nats_mode"] == "mean":
-            kl = kl_one_hot(post_logits, prior_logits).mean().detach()
-            options["free_nats"] = part_free_nats(options["free_nats"], kl, whole(kl))
-        return world_model_loss(error, post_logits, prior_logits, **options)
+        if self.options["free_nats_mode"] == "element":
+            return world_model_update_loss(self.model, batch, draws, **self.options)[0]
+        options = self.options | {"free_nats": 0.0}
+        loss, _ = world_model_update_loss(self.model, batch, draws, **options)
+        total = part_total(loss, whole(loss.kl), self.options["free_nats"])
+        return loss._replace(total=total)
 
 
-def part_free_nats(free_nats: float, part_kl: Tensor, whole_kl: Tensor) -> Tensor:
-    """Return the free nats that clip the mean KL of a part where the whole batch's is clipped.
+def part_total(loss: WorldModelLoss, whole_kl: Tensor, free_nats: float) -> Tensor:
+    """Return a part's Eq. (1), whose KL has a gradient unless free nats clip the whole batch's.
 
-    With f free nats, Eq. (1) takes max(f, kl) of the whole batch's KL. A part with the KL k takes
-    max(f + k - kl, k) = max(f, kl) + k - kl instead: it is clipped exactly where the whole is, and
-    as the mean of all k is kl, the mean over all parts is max(f, kl).
+    A KL that they clip is a constant and left out.
+
+    :param loss: of the part, without free nats
+    :param whole_kl: the mean KL of the whole batch
     """
-    return free_nats + part_kl - whole_kl
+    return torch.where(whole_kl < free_nats, loss.reconstruction, loss.total)

@@ -35,10 +35,9 @@ from wpt_agents.training.world_model_learner import Metrics as Metrics
 from wpt_agents.training.world_model_learner import WorldModelLearner
 
 
-class Imagined(NamedTuple):
-    """Imagined trajectories with their rewards, values and returns: N starts, H steps."""
+class Worth(NamedTuple):
+    """What dreams are worth: N starts, H steps."""
 
-    dream: Dream
     reward: Tensor  # (N, H)
     value: Tensor  # (N, H + 1), of the target critic
     returns: Tensor  # (N, H), Eq. (2)
@@ -53,6 +52,10 @@ class Learner(WorldModelLearner):
         learner = Learner(policy, Hyperparameters(size="tiny"))
         metrics = learner.update(batch, generator)
 
+    Keywords add losses to those of the paper: `reward_grad` and `imitation_grad` to the world
+    model's, `kickstart` to the actor's, `repval_scale` and `slow_critic_scale` to the critic's. The
+    networks that `reward_ensemble`, `continue_head` and `residual` add have losses of their own.
+
     :param policy: whose networks learn
     :param hyperparameters: rates, weights and clips
     """
@@ -63,7 +66,6 @@ class Learner(WorldModelLearner):
         self.actor_optimizer = self.adam([list(policy.actor.parameters())], rate)
         self.critic_optimizer = self.adam([list(policy.critic.parameters())], rate)
         self.add_imitator()
-        self.step = 0  # collected steps, by which schedules go
 
     @property
     def actor_critic_rate(self) -> float:
@@ -94,13 +96,15 @@ class Learner(WorldModelLearner):
         self,
         batch: Batch,
         generator: Generator,
+        step: int = 0,
         imitation_weight: float = 0.0,
         head_start: bool = False,
     ) -> Metrics:
-        """Train world model and reward head on a batch, actor and critic on dreams from its states.
+        """Train world model and heads on a batch, actor and critic on dreams from its states.
 
+        :param step: collected steps, by which schedules go
         :param imitation_weight: of the loss by which the actor imitates the prior actor
-        :param head_start: train the actor on nothing but that imitation
+        :param head_start: train the actor on nothing but that imitation (`actor_delay`)
         """
         settings = self.hyperparameters
         imitator = self.policy.imitator if settings.residual else None
@@ -108,27 +112,27 @@ class Learner(WorldModelLearner):
         states_loss = None
         if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
-        post, metrics = self.update_world_model(
-            batch, generator, learn_reward=True, states_loss=states_loss
-        )
+        post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
             loss = self.imitation_loss(imitator, post, advice)
             self.descend(self.imitator_optimizer, loss, "imitator")
-        imitation = None
+        imitation: Tensor | float = 0.0
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
             imitation = imitation_weight * loss
-        replay_loss = None
+        replay_loss: Tensor | float = 0.0
         if settings.repval_scale:
-            loss = self.replay_value_loss(post, batch)
+            loss = self.replay_value_loss(post, paid)
             metrics["train/replay_value_loss"] = loss.detach()
             replay_loss = settings.repval_scale * loss
-        index = self.draw_starts(batch, generator)
-        start = post.flatten_time().pick(index)
-        behavior = self.update_behavior(start, index, generator, imitation, head_start, replay_loss)
-        return metrics | behavior
+        dream, worth = self.dream(post, paid, generator, step, head_start)
+        spread, scale = self.return_scale(worth.returns)
+        metrics |= self.update_actor(dream, worth, scale, step, imitation, head_start)
+        metrics |= self.update_critic(dream, worth, replay_loss)
+        self.policy.return_scale.copy_(spread)  # now that it is known to be finite
+        return metrics | dream_metrics(dream, worth, scale)
 
     @torch.no_grad()
     def advice(self, batch: Batch) -> Tensor:
@@ -182,129 +186,47 @@ class Learner(WorldModelLearner):
         rows, length = batch.is_first.shape
         return draw_starts(rows, length, number, generator, self.policy.device)
 
-    def update_behavior(
-        self,
-        start: Latent,
-        index: Tensor,
-        generator: Generator,
-        imitation: Tensor | None = None,
-        head_start: bool = False,
-        replay_loss: Tensor | None = None,
-    ) -> Metrics:
-        """Train actor and critic on imagined trajectories, Eq. (2) to (4).
+    def dream(
+        self, post: Latent, paid: Batch, generator: Generator, step: int, head_start: bool
+    ) -> tuple[Dream, Worth]:
+        """Dream from replayed states, and compute what the dreams are worth.
 
-        During the head start (`actor_delay`) the actor's loss is the imitation alone, and without a
-        prior actor it is not updated: reward head and critic learn first.
-
-        :param start: (N, ...), the states to start from
-        :param index: (N,), where they are in the flattened batch
-        :param imitation: added to the actor's loss, but not to the metric of it
-        :param replay_loss: added to the critic's loss, but not to the metric of it
+        :param post: (B, T, ...), the states of the replayed steps
+        :param paid: the batch with the rewards of arriving in them
         """
+        index = self.draw_starts(paid, generator)
+        start = post.flatten_time().pick(index)
+        arrival = paid.reward.flatten()[index]
+        # REINFORCE needs no gradient through the dream, nor does the actor in its head start.
         through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):
-            imagined = self.imagine(start, index, generator)
-        spread, scale = self.return_scale(imagined.returns)
-        metrics = self.update_actor(imagined, scale, imitation, head_start)
-        metrics |= self.update_critic(imagined, replay_loss)
-        self.policy.return_scale.copy_(spread)  # now that it is known to be finite
-        return metrics | {
-            "train/value": imagined.value.detach().mean(),
-            "train/imagined_reward": imagined.reward.detach().mean(),
-            "train/entropy": imagined.dream.entropy.detach().mean(),
-            "train/saturated_actions": imagined.dream.saturated,
-            "train/return_scale": scale,
-        }
+            dream = self.policy.dream(start, self.hyperparameters.imagine_horizon, generator)
+            return dream, self.worth(dream, arrival, step)
 
-    def update_actor(
-        self, imagined: Imagined, scale: Tensor, imitation: Tensor | None, head_start: bool
-    ) -> Metrics:
-        """Take a step on Eq. (4) and the imitation, or in the head start on the imitation alone.
+    def worth(self, dream: Dream, arrival: Tensor, step: int = 0) -> Worth:
+        """Compute what dreams are worth, Eq. (2).
 
-        :param scale: what returns are divided by
-        :param imitation: added to the loss, but not to the metric of it
+        :param arrival: (N,), the replayed rewards of arriving in the states that they start from
+        :param step: collected steps, by which the pessimism goes
         """
-        # In a new context: torch before 2.11 would use the weights again that it has cast in the
-        # dream, without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
-        with self.autocast():
-            loss = self.actor_loss(imagined, scale)
-        if head_start:
-            total = imitation
-        else:
-            total = loss if imitation is None else loss + imitation
-        norm = torch.zeros_like(scale)
-        if total is not None:
-            norm = self.descend(self.actor_optimizer, total, "actor")
-        return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
-
-    def update_critic(self, imagined: Imagined, replay_loss: Tensor | None) -> Metrics:
-        """Take a step on Eq. (3), and move the target critic.
-
-        :param replay_loss: added to the loss, but not to the metric of it
-        """
-        policy = self.policy
         settings = self.hyperparameters
-        gamma = settings.gamma
-        goes_on = imagined.goes_on
-        bin_range = policy.bin_range
-        with self.autocast():
-            logits = over_steps(policy.critic, imagined.dream.states.detach().but_last())
-            loss = critic_loss(logits, imagined.returns, gamma, goes_on, bin_range)
-            total = loss if replay_loss is None else loss + replay_loss
-            if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
-                slow = critic_loss(logits, imagined.value[:, :-1], gamma, goes_on, bin_range)
-                total = total + settings.slow_critic_scale * slow
-        norm = self.descend(self.critic_optimizer, total, "critic")
-        ema_update(policy.target_critic, policy.critic, settings.target_fraction)
-        return {"train/critic_loss": loss.detach(), "train/critic_grad_norm": norm}
-
-    def imagine(self, start: Latent, index: Tensor, generator: Generator) -> Imagined:
-        """Dream from some states and compute what the dreams are worth, Eq. (2)."""
-        settings = self.hyperparameters
-        dream = self.policy.dream(start, settings.imagine_horizon, generator)
-        reward = self.imagined_reward(dream, index)
+        reward = self.imagined_reward(dream, arrival, step)
         value = over_steps(self.policy.target_critic.value, dream.states)
         goes_on = self.imagined_continue(dream)
         returns = lambda_return(reward, value, settings.gamma, settings.lam, goes_on)
-        return Imagined(dream, reward, value, returns, goes_on)
+        return Worth(reward, value, returns, goes_on)
 
-    def actor_loss(self, imagined: Imagined, scale: Tensor) -> Tensor:
-        """Compute Eq. (4), or DreamerV3's REINFORCE on the actions of the dreams.
-
-        :param scale: what returns are divided by
-        """
-        settings = self.hyperparameters
-        dream, reward, value, returns, goes_on = imagined
-        gamma = settings.gamma
-        ent_coef = settings.ent_coef_at(self.step)
-        if settings.actor_grad == "dynamics":
-            return actor_loss(returns, dream.entropy, ent_coef, gamma, scale, goes_on)
-        feat = dream.states.but_last().but_last().feat.detach()
-        dist = self.policy.actor.dist(feat, self.policy.action_mask)
-        weight = discounts(returns.shape[1] - 1, gamma, returns)
-        if goes_on is not None:  # without c_t, which the advantage contains
-            weight = weight * survival(goes_on)[:, :-1]
-        return reinforce_loss(
-            dist.log_prob(dream.action[:, :-1].detach()),
-            advantage(reward, value, returns, gamma if goes_on is None else gamma * goes_on),
-            dist.entropy(),
-            weight,
-            ent_coef,
-            scale,
-        )
-
-    def imagined_reward(self, dream: Dream, index: Tensor) -> Tensor:
+    def imagined_reward(self, dream: Dream, arrival: Tensor, step: int) -> Tensor:
         """Return the rewards of arriving in the imagined states 0 .. H-1, (N, H).
 
-        :param index: (N,), where the dreams start in the flattened batch; rewards by the heads do
-            not depend on it, those of a subclass may
+        :param arrival: of `worth`; the heads predict it, but a subclass may have no such head
         """
         model = self.policy.world_model
         states = dream.states.but_last()
         with frozen(model):
             if model.reward_members:
                 rewards = over_steps(model.rewards, states)
-                return pessimistic_reward(rewards, self.hyperparameters.pessimism_at(self.step))
+                return pessimistic_reward(rewards, self.hyperparameters.pessimism_at(step))
             return over_steps(model.reward, states)
 
     def imagined_continue(self, dream: Dream) -> Tensor | None:
@@ -324,3 +246,90 @@ class Learner(WorldModelLearner):
         unknown = before == 0  # these are the first returns
         spread = torch.where(unknown, width, before.lerp(width, 0.01))  # DreamerV3's rate
         return spread, spread.clamp_min(1.0)
+
+    def update_actor(
+        self,
+        dream: Dream,
+        worth: Worth,
+        scale: Tensor,
+        step: int,
+        imitation: Tensor | float = 0.0,
+        head_start: bool = False,
+    ) -> Metrics:
+        """Take a step on Eq. (4) and the imitation, or in the head start on the imitation alone.
+
+        Without a prior actor to imitate, the actor rests during the head start: reward head and
+        critic learn first.
+
+        :param scale: what returns are divided by
+        :param imitation: added to the loss, but not to the metric of it
+        """
+        # In a new context: torch before 2.11 would use the weights again that it has cast in the
+        # dream, without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
+        with self.autocast():
+            loss = self.actor_loss(dream, worth, scale, step)
+        total = imitation if head_start else loss + imitation
+        norm = torch.zeros_like(scale)
+        if isinstance(total, Tensor):
+            norm = self.descend(self.actor_optimizer, total, "actor")
+        return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
+
+    def actor_loss(self, dream: Dream, worth: Worth, scale: Tensor, step: int = 0) -> Tensor:
+        """Compute Eq. (4), or DreamerV3's REINFORCE on the actions of the dreams.
+
+        :param scale: what returns are divided by
+        :param step: collected steps, by which the weight of the entropy goes
+        """
+        settings = self.hyperparameters
+        reward, value, returns, goes_on = worth
+        gamma = settings.gamma
+        ent_coef = settings.ent_coef_at(step)
+        if settings.actor_grad == "dynamics":
+            return actor_loss(returns, dream.entropy, ent_coef, gamma, scale, goes_on)
+        feat = dream.states.but_last().but_last().feat.detach()
+        dist = self.policy.actor.dist(feat, self.policy.action_mask)
+        weight = discounts(returns.shape[1] - 1, gamma, returns)
+        if goes_on is not None:  # without c_t, which the advantage contains
+            weight = weight * survival(goes_on)[:, :-1]
+        return reinforce_loss(
+            dist.log_prob(dream.action[:, :-1].detach()),
+            advantage(reward, value, returns, gamma if goes_on is None else gamma * goes_on),
+            dist.entropy(),
+            weight,
+            ent_coef,
+            scale,
+        )
+
+    def update_critic(
+        self, dream: Dream, worth: Worth, replay_loss: Tensor | float = 0.0
+    ) -> Metrics:
+        """Take a step on Eq. (3), and move the target critic.
+
+        :param replay_loss: added to the loss, but not to the metric of it
+        """
+        policy = self.policy
+        settings = self.hyperparameters
+        gamma = settings.gamma
+        goes_on = worth.goes_on
+        bin_range = policy.bin_range
+        with self.autocast():
+            logits = over_steps(policy.critic, dream.states.detach().but_last())
+            loss = critic_loss(logits, worth.returns, gamma, goes_on, bin_range)
+            total = loss + replay_loss
+            if settings.slow_critic_scale:  # DreamerV3's regulariser, towards the target critic
+                slow = critic_loss(logits, worth.value[:, :-1], gamma, goes_on, bin_range)
+                total = total + settings.slow_critic_scale * slow
+        norm = self.descend(self.critic_optimizer, total, "critic")
+        ema_update(policy.target_critic, policy.critic, settings.target_fraction)
+        return {"train/critic_loss": loss.detach(), "train/critic_grad_norm": norm}
+
+
+def dream_metrics(dream: Dream, worth: Worth, scale: Tensor) -> Metrics:
+    """Return the metrics of dreams."""
+    return {
+        "train/value": worth.value.detach().mean(),
+        "train/imagined_reward": worth.reward.detach().mean(),
+        "train/entropy": dream.entropy.detach().mean(),
+        "train/saturated_actions": dream.saturated,
+        "train/return_scale": scale,
+    }

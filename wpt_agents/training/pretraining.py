@@ -77,14 +77,12 @@ def pretrain(
     :param callback: called after every update
     """
     assert model.dataset is not None
-    done = model.progress.pretrain_steps
-    facts = {"steps": steps, "pretrain_steps": done, "accumulate": accumulate}
+    facts = {"steps": steps, "accumulate": accumulate}
+    facts |= {"pretrain_steps": model.progress.pretrain_steps}
     facts |= model.hyperparameters.as_dict() | {"dataset": model.dataset.fingerprint}
     world.check_same(facts)
     model.adapt_to_data(model.dataset)
-    updates = world_model_updates(
-        model.learner, model.dataset, model.streams, world, done, steps, accumulate, progress_bar
-    )
+    updates = world_model_updates(model, world, steps, accumulate, progress_bar)
     with closing(updates), Pretraining(model, steps, run_dir, callback, world) as run:
         for metrics in updates:
             run.finish_update(metrics)
@@ -185,26 +183,22 @@ class Pretraining:
 
 
 def world_model_updates(
-    learner: WorldModelLearner,
-    dataset: TrajectoryDataset,
-    streams: Streams,
-    world: World,
-    start: int,
-    steps: int,
-    accumulate: int = 1,
-    progress_bar: bool = False,
+    model: Pretrainable, world: World, steps: int, accumulate: int, progress_bar: bool
 ) -> Generator[Metrics, None, None]:
-    """Train a world model on reward-free trajectories by Eq. (1); yield each update's metrics.
+    """Train a model's world model on its dataset by Eq. (1); yield each update's metrics.
 
     Batch k depends on the seed and k alone, so that training that is interrupted continues exactly.
 
     :param world: the processes that share the work; a batch is divided among them
-    :param start: updates that were made before
     :param steps: updates in all
     :param accumulate: passes over a batch, or a process's share of it, to save memory
     """
+    assert model.dataset is not None
+    learner = model.learner
+    streams = model.streams
     settings = learner.hyperparameters
-    batches = dataset.batches(
+    start = model.progress.pretrain_steps
+    batches = model.dataset.batches(
         settings.batch_size,
         settings.batch_length,
         settings.max_action_dim,
@@ -238,7 +232,8 @@ def whole_update(learner: WorldModelLearner, streams: Streams) -> Update:
 
     def update(batch: Batch, step: int) -> Metrics:
         generator = streams.torch(Purpose.PRETRAIN, step, device)
-        return learner.update_world_model(batch.to(device), generator)[1]
+        _, _, metrics = learner.update_world_model(batch.to(device), generator)
+        return metrics
 
     return update
 
@@ -247,15 +242,7 @@ def divided_update(
     learner: WorldModelLearner, streams: Streams, world: World, accumulate: int
 ) -> Update:
     """Return an update on this process's share of a batch, in several passes."""
-    settings = learner.hyperparameters
-    divided = Divided(
-        learner.policy.world_model,
-        world,
-        accumulate,
-        settings.batch_size,
-        learner.autocast,
-        learner.eq_1_options,
-    )
+    divided = Divided(learner, world, accumulate)
 
     def update(batch: Batch, step: int) -> Metrics:
         optimizer = learner.model_optimizer

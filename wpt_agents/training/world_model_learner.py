@@ -82,14 +82,15 @@ class WorldModelLearner:
         generator: Generator,
         learn_reward: bool = False,
         states_loss: StatesLoss | None = None,
-    ) -> tuple[Latent, Metrics]:
+    ) -> tuple[Latent, Batch, Metrics]:
         """Take a step on Eq. (1), and on the reward likelihood.
 
         The likelihood trains the reward head and, by the weight `reward_grad`, the states: not at
         all in the paper (Algorithm 1, r_ξ).
 
         :param states_loss: a further loss, which trains the states
-        :return: the posterior states (B, T, ...), without gradient
+        :return: the posterior states (B, T, ...), without gradient, the batch with the rewards that
+            actor and critic learn from, and the metrics
         """
         model = self.policy.world_model
         metrics: Metrics = {}
@@ -108,7 +109,7 @@ class WorldModelLearner:
         post = post.detach()
         if learn_reward:
             metrics |= self.update_reward_members(post, batch)
-        return post, metrics | world_model_metrics(loss, norm)
+        return post, batch, metrics | world_model_metrics(loss, norm)
 
     def update_reward_members(self, post: Latent, batch: Batch) -> Metrics:
         """Take a step on the further reward heads, if there are any."""

@@ -314,21 +314,18 @@ class HeadStart(BaseCallback):
 
     def _on_training_start(self) -> None:
         agent: Any = self.model
-        delay = getattr(agent, "actor_delay", 0)
-        if not delay:
-            return
-        update = agent.update
+        if getattr(agent, "actor_delay", 0):
+            # Updates of imagination may follow at once, before SB3 calls any callback.
+            agent.after_update = self.save_at_its_end
 
-        def update_and_save(metrics: Any) -> None:
-            update(metrics)
-            if agent.task_updates == delay:
-                agent.save(self.path)
-
-        # SB3 calls no callback between updates, and those of imagination may follow at once.
-        agent.update = update_and_save
+    def save_at_its_end(self) -> None:
+        """Save the agent after the last update of its head start."""
+        agent: Any = self.model
+        if agent.task_updates == agent.actor_delay:
+            agent.save(self.path)
 
     def _on_training_end(self) -> None:
-        vars(self.model).pop("update", None)
+        vars(self.model).pop("after_update", None)
 
     def _on_step(self) -> bool:
         return True

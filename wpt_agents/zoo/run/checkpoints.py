@@ -281,11 +281,16 @@ class Checkpoints(BaseCallback):
             return
         self.signals.start()  # not sooner: nothing can be saved while the prior actor is trained
         steps = self.model.num_timesteps - self.written
-        due = self.every and (steps >= self.every or time.monotonic() - self.written_at >= SECONDS)
-        if steps and (due or self.signals.received):
+        if steps and (self.signals.received or self._is_due(steps)):
             self._write()
         if self.signals.received:
             self.signals.deliver(self.signals.received)
+
+    def _is_due(self, steps: int) -> bool:
+        """Return whether so many steps, or the time that they took, need a checkpoint."""
+        if not self.every:
+            return False
+        return steps >= self.every or time.monotonic() - self.written_at >= SECONDS
 
     def _on_step(self) -> bool:
         return True

@@ -287,7 +287,7 @@ class Checkpoints(BaseCallback):
             self.signals.deliver(self.signals.received)
 
     def _is_due(self, steps: int) -> bool:
-        """Return whether so many steps, or the time that they took, need a checkpoint."""
+        """Return whether it is time for a checkpoint, `steps` after the last one."""
         if not self.every:
             return False
         return steps >= self.every or time.monotonic() - self.written_at >= SECONDS

@@ -152,6 +152,11 @@ def test_load_refuses_unknown_keywords(tmp_path):
         WPT.load(tmp_path / "model", ent_coeff=1e-3)
 
 
+def test_the_name_of_another_policy_is_refused_with_the_one_there_is():
+    with pytest.raises(ValueError, match=r"No policy 'CnnPolicy'.* There are: WPTPolicy"):
+        WPT("CnnPolicy", ClockEnv(), **SETTINGS)
+
+
 def test_the_constructor_refuses_unknown_keywords():
     with pytest.raises(TypeError, match="batchsize"):
         agent(batchsize=3)

@@ -100,6 +100,8 @@ class SavedAgent(BaseAlgorithm):
     ) -> None:
         if unknown := keywords.keys() - self.keywords.declared().keys():
             raise TypeError(str(unknown_name("keyword", min(unknown), self.keywords.declared())))
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise unknown_name("policy", policy, self.policy_aliases)
         check_device(device)
         self.hyperparameters = self.keywords(**keywords)
         self.progress = self.progress_class()

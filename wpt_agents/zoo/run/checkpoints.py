@@ -277,7 +277,8 @@ class Checkpoints(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         starts = self.model._last_episode_starts
-        if self.every is None or starts is None or not starts.all():  # within a long episode
+        between = starts is not None and starts.all()  # but not within a long episode
+        if self.every is None or not between:
             return
         self.signals.start()  # not sooner: nothing can be saved while the prior actor is trained
         steps = self.model.num_timesteps - self.written

@@ -37,8 +37,8 @@ Work = Callable[[Run], None]
 Tick = Callable[[], None]  # called repeatedly while waiting; should be fast
 Errors = dict[Path, str]  # by run folder, of the runs that failed
 STOPPING = (
-    "each process saves its work first, a run after its episode and the updates of it; Ctrl-C "
-    "again stops all at once"
+    "each run first completes its episode and its updates, and is saved; Ctrl-C again stops all "
+    "runs at once"
 )
 
 

@@ -6,6 +6,7 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.behavior_cloning import (
     FRAMES,
     PriorActor,
+    TrajectoryVariances,
     bc_loss,
     draw_pairs,
     random_shift,
@@ -112,7 +113,9 @@ def test_a_pair_is_what_was_seen_up_to_a_step_and_the_action_taken_at_it():
         action = np.full((steps, 2), 0.1 * i) + 0.01 * times[:-1, None]
         return Trajectory(image.astype(np.uint8), action.astype(np.float32))
 
-    image, action = draw_pairs([episode(1, 4), episode(2, 1)], 400, 3, np.random.default_rng(0))
+    pairs = draw_pairs([episode(1, 4), episode(2, 1)], 400, 3, np.random.default_rng(0))
+    image, action, chosen = pairs
+    assert torch.equal(chosen == 0, image[:, -1, 0, 0, 0] < 20)
     assert image.shape == (400, FRAMES, 64, 64, 3) and action.shape == (400, 3)
     shown, taken = image[:, :, 0, 0, 0].tolist(), action[:, 0].tolist()
     pairs = {(*frames, round(a, 2)) for frames, a in zip(shown, taken, strict=True)}
@@ -121,6 +124,42 @@ def test_a_pair_is_what_was_seen_up_to_a_step_and_the_action_taken_at_it():
     assert (action[:, 2] == 0).all()
     share = sum(frames[-1] == 20 for frames in shown) / 400  # one step of five
     assert share == pytest.approx(0.2, abs=0.06)
+
+
+def test_weights_make_the_loss_that_of_gaussians_with_variances_of_their_own():
+    prediction = torch.tensor([[0.5, 1.0, 9.0], [0.2, -0.5, 9.0]], requires_grad=True)
+    action = torch.tensor([[0.1, 0.2, 0.0], [0.3, 0.4, 0.0]])
+    variance = torch.tensor([0.5, 2.0])
+    bc_loss(prediction, action, OWN, weight=0.5 / variance).backward()
+    normal = torch.distributions.Normal(prediction, variance[:, None].sqrt())
+    likelihood = -normal.log_prob(action)[:, :2].mean()
+    torch.testing.assert_close(prediction.grad, torch.autograd.grad(likelihood, prediction)[0])
+
+
+def test_the_variance_of_a_trajectory_follows_its_own_errors():
+    variances = TrajectoryVariances(3)
+    prediction = torch.zeros(3, 3, requires_grad=True)
+    # squared errors of 0.04 and 0.16, both of trajectory 2, and of 0.81, of trajectory 0
+    action = torch.tensor([[0.2, 0.2, 5.0], [0.4, 0.4, 5.0], [0.9, 0.9, 5.0]])
+    chosen = torch.tensor([2, 2, 0])
+    variances.update(prediction, action, OWN, chosen)
+    expected = torch.tensor([0.95 + 0.05 * 0.81, 1.0, 0.95 + 0.05 * 0.10])
+    torch.testing.assert_close(variances.values, expected)
+    for _ in range(400):
+        variances.update(prediction, action, OWN, chosen)
+    torch.testing.assert_close(variances.values, torch.tensor([0.81, 1.0, 0.10]))
+    weights = variances.weights()
+    torch.testing.assert_close(weights / weights[1], torch.tensor([1 / 0.81, 1.0, 10.0]))
+    assert weights.mean().item() == pytest.approx(1.0)
+    assert not variances.values.requires_grad
+
+
+def test_no_trajectory_outweighs_all_others():
+    variances = TrajectoryVariances(2)
+    still = torch.zeros(1, 3)
+    for _ in range(400):
+        variances.update(still, still, OWN, torch.tensor([0]))
+    assert (variances.weights()[0] / variances.weights()[1]).item() == pytest.approx(100)
 
 
 def test_what_is_imitated_sees_the_last_three_images_of_its_own_episode():

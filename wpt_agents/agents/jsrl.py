@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from wpt_agents.agents.drqv2 import DrQv2, DrQv2Keywords
+from wpt_agents.model.behavior_cloning import BC_VARIANCES
 from wpt_agents.model.prior_policy import PriorPolicy, prior_action
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training.cloning import Cloning, clone
@@ -48,6 +49,12 @@ class JSRLKeywords(DrQv2Keywords):
     )
     bc_learning_rate: float = amount(
         1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
+    )
+    bc_variance: str = choice(
+        "fixed",
+        BC_VARIANCES,
+        'variance of the clone\'s Gaussian: "fixed", or "trajectory", as in WPT',
+        Stage.CLONING,
     )
     warmup_steps: int = count(
         0,
@@ -93,7 +100,10 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
             return
         settings = self.hyperparameters
         cloning = Cloning(
-            settings.value("bc_steps"), settings.value("bc_batch_size"), settings.bc_learning_rate
+            settings.value("bc_steps"),
+            settings.value("bc_batch_size"),
+            settings.bc_learning_rate,
+            settings.bc_variance,
         )
         trained = clone(
             self.policy.prior_actor,

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Generator, Tensor, nn
+from torch.nn.functional import one_hot
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.images import Encoder
@@ -13,28 +14,67 @@ from wpt_agents.model.ops import op
 from wpt_agents.model.sizes import Size
 
 FRAMES = 3  # a single image does not show velocities
+BC_VARIANCES = ("fixed", "trajectory")
 
 
-def bc_loss(prediction: Tensor, action: Tensor, mask: Tensor) -> Tensor:
-    """-log π_bc(a | o) of a Gaussian with fixed variance, up to constants: the squared error.
+def bc_loss(
+    prediction: Tensor, action: Tensor, mask: Tensor, weight: Tensor | None = None
+) -> Tensor:
+    """-log π_bc(a | o) of a Gaussian, up to constants: the squared error, over the variance.
 
     :param prediction: (N, A), the Gaussian's mean
     :param action: (N, A), taken at the observation
     :param mask: (A,) bool, True at the embodiment's own entries; the others do not count
+    :param weight: (N,), proportional to one over the variance; None for a fixed variance
     """
     assert prediction.shape == action.shape, (prediction.shape, action.shape)
-    return ((prediction - action).square() * mask).sum() / (mask.sum() * len(action))
+    squares = (prediction - action).square() * mask
+    if weight is not None:
+        squares = squares * weight[:, None]
+    return squares.sum() / (mask.sum() * len(action))
+
+
+class TrajectoryVariances:
+    """σ_i²: how far the actions of each trajectory are from the prior actor's, on average.
+
+    They maximise the likelihood of all actions, if those of trajectory i are Gaussian around the
+    prior actor's with a variance of its own. The squared errors of a trajectory then count in
+    proportion to 1 / σ_i², so that a noisy demonstrator has less influence. Not in the paper.
+    Source of the idea, for discrete actions: https://arxiv.org/abs/2202.01288
+
+    :param n: number of trajectories
+    """
+
+    least = 0.01  # a standard deviation of 0.1, so that no trajectory can outweigh all others
+    rate = 0.05  # of the running mean
+
+    def __init__(self, n: int, device: torch.device | None = None) -> None:
+        self.values = torch.ones(n, device=device)
+
+    def update(self, prediction: Tensor, action: Tensor, mask: Tensor, chosen: Tensor) -> None:
+        """Let the variances follow the errors of a batch, (N, A), drawn from `chosen`, (N,)."""
+        error = ((prediction.detach() - action).square() * mask).sum(1) / mask.sum()
+        drawn = one_hot(chosen, len(self.values)).to(error.dtype)  # a sum in a fixed order
+        number = drawn.sum(0)
+        mean = (error @ drawn) / number.clamp_min(1)
+        self.values = torch.where(number > 0, self.values.lerp(mean, self.rate), self.values)
+
+    def weights(self) -> Tensor:
+        """Return the weight of each trajectory, (n,), 1 on average."""
+        precision = 1 / self.values.clamp_min(self.least)
+        return precision / precision.mean()
 
 
 def draw_pairs(
     trajectories: Sequence[Trajectory], n: int, action_dim: int, rng: np.random.Generator
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Draw n steps of all trajectories: the images seen, and the action that was then taken.
 
     Before an episode's third image, its first image takes the place of the missing ones, as in
     acting.
 
-    :return: images (n, F, 64, 64, 3) uint8, oldest first, and actions (n, A), padded with zeros
+    :return: images (n, F, 64, 64, 3) uint8, oldest first, actions (n, A), padded with zeros, and
+        the indices of the trajectories, (n,)
     """
     ends = np.cumsum([len(trajectory) for trajectory in trajectories])
     draws = rng.integers(ends[-1], size=n)
@@ -46,7 +86,7 @@ def draw_pairs(
     for row, i, t in zip(action, chosen, steps, strict=True):
         taken = trajectories[i].action[t]
         row[: len(taken)] = taken
-    return torch.from_numpy(image), torch.from_numpy(action)
+    return torch.from_numpy(image), torch.from_numpy(action), torch.from_numpy(chosen)
 
 
 def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:

@@ -11,7 +11,13 @@ from torch.optim.lr_scheduler import LinearLR
 
 from wpt_agents.data.bars import shown
 from wpt_agents.data.trajectory import Trajectory
-from wpt_agents.model.behavior_cloning import PriorActor, bc_loss, draw_pairs, random_shift
+from wpt_agents.model.behavior_cloning import (
+    PriorActor,
+    TrajectoryVariances,
+    bc_loss,
+    draw_pairs,
+    random_shift,
+)
 from wpt_agents.training.descent import descend
 from wpt_agents.training.randomness import Purpose, Streams
 
@@ -23,12 +29,14 @@ class Cloning:
     :param steps: updates
     :param batch_size: images and actions in an update
     :param learning_rate: at the first update; it falls linearly to 0
+    :param variance: "fixed", or "trajectory", an estimate for each trajectory
     :param grad_clip: largest norm of the gradient
     """
 
     steps: int
     batch_size: int
     learning_rate: float
+    variance: str
     grad_clip: float = 100.0
 
 
@@ -53,13 +61,19 @@ def clone(
     # A constant rate keeps the noise of the last steps; a fall to 0 averages it out. A deviation
     # from the paper, which prints one rate (docs/paper.md).
     falling = LinearLR(optimizer, 1.0, 0.0, settings.steps)
+    estimated = settings.variance == "trajectory"
+    variances = TrajectoryVariances(len(trajectories), device) if estimated else None
     for step in shown(range(settings.steps), settings.steps, "clone", progress_bar):
         rng = streams.numpy(Purpose.CLONE, step)
         pairs = draw_pairs(trajectories, settings.batch_size, len(action_mask), rng)
-        image, action = (tensor.to(device) for tensor in pairs)
+        image, action, chosen = (tensor.to(device) for tensor in pairs)
         with autocast():
             image = random_shift(image, generator=streams.torch(Purpose.CLONE, step, device))
-            loss = bc_loss(actor(image), action, action_mask)
+            prediction, weight = actor(image), None
+            if variances is not None:
+                variances.update(prediction, action, action_mask, chosen)
+                weight = variances.weights()[chosen]
+            loss = bc_loss(prediction, action, action_mask, weight)
         descend(optimizer, loss, "bc", settings.grad_clip)
         falling.step()
     return actor

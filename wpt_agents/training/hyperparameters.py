@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wpt_agents.model.behavior_cloning import FRAMES
+from wpt_agents.model.behavior_cloning import BC_VARIANCES, FRAMES
 from wpt_agents.model.distributions import BIN_RANGE
 from wpt_agents.model.sizes import Size, find_size, plain_size
 from wpt_agents.training.guidance import Schedule, ever, parse_schedule
@@ -339,6 +339,14 @@ class Hyperparameters(Keywords):
     bc_learning_rate: float = amount(
         1e-4,
         "learning rate of the prior actor at its first update; it falls linearly to 0",
+        Stage.CLONING,
+    )
+    bc_variance: str = choice(
+        "fixed",
+        BC_VARIANCES,
+        'variance of the prior actor\'s Gaussian: "fixed", the same for all trajectories, or '
+        '"trajectory", estimated for each of them from its errors, so that noisy trajectories '
+        "count less. Not in the paper",
         Stage.CLONING,
     )
 

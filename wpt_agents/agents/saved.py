@@ -362,9 +362,11 @@ class SavedAgent(BaseAlgorithm):
         agent._setup_model()
         agent.policy.set_action_space(agent.action_space)
         agent.restore(header, tensors, cls.shape_keywords)
-        agent.warn_if_late(header, tensors)
+        learner = agent.learner
         if env is not None:
             agent.set_env(env, force_reset)
+        if agent.learner is learner:  # no reset, as for actions of another width
+            agent.warn_if_late(header, tensors)
         return agent
 
     def restore(
@@ -385,15 +387,15 @@ class SavedAgent(BaseAlgorithm):
     def warn_if_late(
         self, header: Mapping[str, Any], tensors: Mapping[str, Mapping[str, Tensor]]
     ) -> None:
-        """Warn of keywords that differ from those of a model file and have no effect on it."""
+        """Warn of keywords that differ from a model file's and take effect after a reset only."""
         before = self.keywords.of(header["hyperparameters"])
         late = {stage: self.too_late(stage) for stage in (Stage.RETRIEVAL, Stage.CLONING)}
         if model_files.WORLD_MODEL not in tensors:
-            late[Stage.DRAWING] = "the weights are loaded; reset_task() draws others by it"
+            late[Stage.DRAWING] = "the weights are loaded; call reset_task() to draw others"
         for name, declared in self.keywords.declared().items():
             value = self.hyperparameters.value(name)
             if value != before.value(name) and (why := late.get(declared.stage)):
-                warnings.warn(f"{name}={value!r} has no effect on this model: {why}", stacklevel=3)
+                warnings.warn(f"{name}={value!r} has no effect yet: {why}", stacklevel=3)
 
     def _load_tensors(self, tensors: Mapping[str, Mapping[str, Tensor]]) -> None:
         self.fit_networks(tensors.get("policy", {}))

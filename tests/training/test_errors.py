@@ -1,6 +1,7 @@
 """Bad input: each error names the culprit and the remedy, and nothing is lost."""
 
 import inspect
+import re
 from dataclasses import asdict
 
 import gymnasium as gym
@@ -63,6 +64,20 @@ def test_an_environment_that_does_not_fit_is_refused(env, words):
 def test_learning_without_an_environment_says_how_to_give_one():
     with pytest.raises(ValueError, match=r"call set_env\(env\), or pass env="):
         agent().learn(10)
+
+
+@pytest.mark.parametrize("steps", ["100", True, 1.5, -1, np.nan, np.inf, None])
+def test_learn_refuses_what_is_no_number_of_steps_and_changes_nothing(steps):
+    model = agent(ClockEnv()).learn(7)
+    got = re.escape(f"at least 0, got {steps!r}: pass the number of steps to collect, such as")
+    with pytest.raises(ValueError, match=f"total_timesteps must be a whole number of {got}"):
+        model.learn(steps)
+    assert model.num_timesteps == 7
+
+
+@pytest.mark.parametrize("steps", [1e1, np.int64(10), np.float32(10)])
+def test_a_whole_number_of_steps_may_be_of_any_type(steps):
+    assert agent(ClockEnv()).learn(steps).num_timesteps == 10
 
 
 def test_an_unknown_environment_is_named():

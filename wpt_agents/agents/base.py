@@ -40,7 +40,7 @@ from wpt_agents.agents.saved import SavedAgent
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
-from wpt_agents.training.checks import check_rewards
+from wpt_agents.training.checks import check_rewards, whole_steps
 from wpt_agents.training.evaluations import show_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
@@ -117,14 +117,17 @@ class PixelAgent(SavedAgent):
     ) -> Self:
         """Collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. 0
+            makes no step and no update, but the preparations for them, such as reading offline
+            data
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :param tb_log_name: name of the run's folder in `tensorboard_log`
         :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
         :param progress_bar: show a progress bar
         :return: the agent itself
-        :raises ValueError: no environment, or rewards that are not finite
+        :raises ValueError: no environment, `total_timesteps` that are no whole number of at least
+            0, or rewards that are not finite
         :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with self.learning(
@@ -147,6 +150,7 @@ class PixelAgent(SavedAgent):
         """Set up what `learn` needs, reset the environment, call the first and last callback."""
         if self.env is None:
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
+        total_timesteps = whole_steps(total_timesteps)
         if reset_num_timesteps:
             self.progress.restart_steps()
         if resets(self.env) != self._resets_seen:

@@ -44,7 +44,7 @@ class Odd(ClockEnv):
         (Odd(action=spaces.Discrete(3)), r"Discrete\(3\): wrap it .*TransformAction"),
         (Odd(action=spaces.Box(-1, 1, (2, 2))), r"one-dimensional Box, .*\(2, 2\)"),
         (Odd(action=spaces.Box(-np.inf, 1, (2,))), "finite bounds, .*TransformAction"),
-        (ClockEnv(actions=5), "5 actions, .* max_action_dim=4: pre-train with a larger"),
+        (ClockEnv(actions=5), "5 actions, .* max_action_dim=4: make it with max_action_dim=5"),
         (Odd(spaces.Box(-1, 1, (17,))), "sees images, .*17.*AddRenderObservation"),
         (Odd(spaces.Box(0, 1, (64, 64, 3))), "sees images, .*float32.*convert them: .*255"),
         (Odd(spaces.Box(0, 255, (64, 64, 2), np.uint8)), r"sees images, .*\(64, 64, 2\)"),
@@ -59,6 +59,21 @@ def test_an_environment_that_does_not_fit_is_refused(env, words):
     assert model.get_env() is before and model.learn(7).num_timesteps == 7
     with pytest.raises(ValueError, match=words):
         agent(env)
+
+
+def test_a_pretrained_model_is_to_be_pretrained_again_for_more_actions(tmp_path):
+    words = "max_action_dim=4: pre-train with a larger max_action_dim"
+    model = pretrained([recorded()])
+    with pytest.raises(ValueError, match=words):
+        model.set_env(ClockEnv(actions=5))
+    model.save_world_model(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=words):
+        WPT.load(tmp_path / "model.zip", env=ClockEnv(actions=5))
+
+
+def test_pretraining_for_an_environment_of_more_actions_names_the_keyword_before_it_begins():
+    with pytest.raises(ValueError, match="max_action_dim=4: make it with max_action_dim=5"):
+        pretrained([recorded()], env=ClockEnv(actions=5))
 
 
 def test_learning_without_an_environment_says_how_to_give_one():

@@ -19,6 +19,7 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training import cloning, learner, pretraining, world_model_learner
 from wpt_agents.training.hyperparameters import SIZES_OWN, Hyperparameters
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 
 
@@ -404,10 +405,10 @@ def test_what_open_loop_cannot_show_is_refused_by_name():
 
 def test_a_plan_with_such_a_value_is_refused_before_anything_is_made(tmp_path):
     with pytest.raises(ValueError, match="gamma must be a number in"):
-        make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], ["gamma=high"], tmp_path, 1, "cpu")
+        make_plan("dmc", ["walker-run"], Request("debug", settings=["gamma=high"], out=tmp_path))
 
 
 @pytest.mark.parametrize("task", ["metaworld-drawer-close", "drawer-close"])
 def test_a_task_of_another_suite_is_told_its_suite(tmp_path, task):
     with pytest.raises(ValueError, match=r"of the suite metaworld: (pass )?--suite metaworld"):
-        make_plan("dmc", [task], "debug", "1", ["wpt"], [], tmp_path, 1, "cpu")
+        make_plan("dmc", [task], Request("debug", out=tmp_path))

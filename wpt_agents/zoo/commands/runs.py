@@ -232,6 +232,7 @@ def run_benchmark(
 
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.presets import load_preset
+    from wpt_agents.zoo.plan.request import Request
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
     from wpt_agents.zoo.report import record_page
@@ -245,6 +246,7 @@ def run_benchmark(
     preset_suite = find_sequence(sequence).suite if sequence else suite
     if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
+    request = Request(preset, seeds, method, changes, out, workers, device, data)
     resources = Resources(
         workers=workers,
         cpus=cpus,
@@ -263,12 +265,10 @@ def run_benchmark(
     if sequence:
         if tasks or watch or engine != "none":
             raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
-        jobs = make_sequences(sequence, preset, seeds, method, changes, out, workers, device, data)
-        if not do_sequences(jobs, force, dry_run):
+        if not do_sequences(make_sequences(sequence, request), force, dry_run):
             raise typer.Exit(1)
         return
-    plan = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
-    runs = [replace(run, record=record) for run in plan]
+    runs = [replace(run, record=record) for run in make_plan(suite, tasks, request)]
     if watch:
         show_standings(runs)
         return

@@ -1,5 +1,6 @@
 """The commands that plan and execute runs: list, pretrain, run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -235,7 +236,6 @@ def run_benchmark(
     from wpt_agents.zoo.plan.request import Request
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
-    from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
@@ -258,22 +258,29 @@ def run_benchmark(
         partition=partition,
     )
     check_resources(engine, resources)
-    if record is not None:
-        if sequence or watch:
-            raise ValueError("--record cannot be combined with --sequence or --watch")
-        record_page.check(record)
+    _check_combination(sequence, tasks, watch, engine, record)
     if sequence:
-        if tasks or watch or engine != "none":
-            raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
         if not do_sequences(make_sequences(sequence, request), force, dry_run):
             raise typer.Exit(1)
         return
     runs = [replace(run, record=record) for run in make_plan(suite, tasks, request)]
     if watch:
         show_standings(runs)
-        return
-    if dry_run:
+    elif dry_run:
         preview(runs, engine, force)
-        return
-    if not do_plan(runs, engine, force, resources):
+    elif not do_plan(runs, engine, force, resources):
         raise typer.Exit(1)
+
+
+def _check_combination(
+    sequence: str, tasks: Sequence[str], watch: bool, engine: str, record: Path | None
+) -> None:
+    """Raise an error for options that exclude each other, or for a path that is no record."""
+    from wpt_agents.zoo.report import record_page
+
+    if record is not None:
+        if sequence or watch:
+            raise ValueError("--record cannot be combined with --sequence or --watch")
+        record_page.check(record)
+    if sequence and (tasks or watch or engine != "none"):
+        raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")

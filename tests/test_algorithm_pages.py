@@ -15,6 +15,7 @@ import wpt_agents
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.methods import ABLATION, METHODS, defaults
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.plan.sequences import make_sequences
 from wpt_agents.zoo.report import figure2, figure4
@@ -63,11 +64,11 @@ def options_of(command):
 def test_every_command_of_the_pages_can_be_planned(command, tmp_path):
     options = options_of(command)
     settings = list(options["settings"] or [])
-    common = options["preset"], options["seeds"], options["method"], settings, tmp_path, 1, "cpu"
+    request = Request(options["preset"], options["seeds"], options["method"], settings, tmp_path)
     if options["sequence"]:
-        assert make_sequences(options["sequence"], *common)
+        assert make_sequences(options["sequence"], request)
     else:
-        assert make_plan(options["suite"], options["tasks"] or [], *common)
+        assert make_plan(options["suite"], options["tasks"] or [], request)
 
 
 def test_the_commands_of_the_papers_figures_and_tables_make_all_that_the_report_looks_for():
@@ -88,11 +89,11 @@ def test_the_commands_of_the_papers_figures_and_tables_make_all_that_the_report_
 @pytest.mark.parametrize("command", PAPERS)
 def test_the_papers_figures_can_be_made_on_a_cpu_too(command, tmp_path):
     options = options_of(command.replace("--preset paper", "--preset mid"))
-    common = "mid", options["seeds"], options["method"], [], tmp_path, 1, "cpu"
+    request = Request("mid", options["seeds"], options["method"], out=tmp_path)
     if options["sequence"]:
-        assert make_sequences(options["sequence"], *common)
+        assert make_sequences(options["sequence"], request)
     else:
-        assert make_plan(options["suite"], options["tasks"] or [], *common)
+        assert make_plan(options["suite"], options["tasks"] or [], request)
 
 
 def calls(page):

@@ -111,8 +111,8 @@ def test_hyperparameters_themselves_cannot_be_written():
 @pytest.mark.parametrize(
     ("name", "value", "why"),
     [
-        ("zero_init_heads", True, r"weights are loaded; reset_task\(\) draws others"),
-        ("actor_outscale", 0.01, r"weights are loaded; reset_task\(\) draws others"),
+        ("zero_init_heads", True, r"weights are loaded; call reset_task\(\) to draw others"),
+        ("actor_outscale", 0.01, r"weights are loaded; call reset_task\(\) to draw others"),
         ("num_retrieve", 1, r"trajectories are retrieved; call reset_task\(\)"),
         ("bc_steps", 1, r"prior actor is cloned; call reset_task\(\)"),
     ],
@@ -122,11 +122,28 @@ def test_a_keyword_that_comes_too_late_for_a_model_file_is_warned_of(
 ):
     model = pretrained(data, env=DotEnv(), zero_init_heads=False).learn(1)
     model.save(tmp_path / "model")
-    with pytest.warns(UserWarning, match=f"{name}={value} has no effect .*: .*{why}") as caught:
+    with pytest.warns(UserWarning, match=f"{name}={value} has no effect yet: .*{why}") as caught:
         WPT.load(tmp_path / "model", **{name: value})
     assert caught[0].filename == __file__
     WPT.load(tmp_path / "model", **{name: getattr(model, name)})  # says nothing
     WPT.load(tmp_path / "model", dataset=[recorded(seed=9)], num_retrieve=1, bc_steps=1)
+
+
+def test_a_keyword_that_was_warned_of_takes_effect_after_a_reset(tmp_path):
+    agent().save(tmp_path / "model")
+    with pytest.warns(UserWarning, match=r"actor_outscale=0.0 has no effect yet"):
+        loaded = WPT.load(tmp_path / "model", actor_outscale=0.0)
+    assert loaded.policy.actor.layers[-1].weight.any()
+    loaded.reset_task()
+    assert not loaded.policy.actor.layers[-1].weight.any()
+
+
+def test_no_keyword_comes_too_late_where_other_actions_begin_a_new_task(data, tmp_path):
+    pretrained(data, env=DotEnv()).learn(1).save(tmp_path / "model")
+    late = {"actor_outscale": 0.0, "num_retrieve": 1, "bc_steps": 1}
+    loaded = WPT.load(tmp_path / "model", env=DotEnv(actions=3), **late)  # says nothing
+    assert not loaded.policy.actor.layers[-1].weight.any()
+    assert not loaded.retrieved_ids and loaded.prior is None
 
 
 def test_a_keyword_of_new_heads_takes_effect_where_a_file_has_none(tmp_path):

@@ -11,7 +11,7 @@ from debug_agent import ClockEnv, agent, noise, on_time
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
-from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -280,6 +280,31 @@ def test_an_evaluation_sees_the_same_entry_and_takes_over_normalised_rewards(wra
     assert evaluation.last_mean_reward == 28
     assert eval_env.ret_rms.count == pytest.approx(model.get_vec_normalize_env().ret_rms.count, 8)
     assert eval_env.ret_rms.count > 2 and evaluation.eval_env is eval_env
+
+
+class Refusing(BaseCallback):
+    """A callback that raises an error at the start, when it is called by this name."""
+
+    def __init__(self, at):
+        super().__init__()
+        setattr(self, at, self.refuse)
+
+    def refuse(self):
+        raise ValueError("refused")
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.filterwarnings("ignore:Of the Dict")
+@pytest.mark.parametrize("at", ["_init_callback", "_on_training_start"])
+def test_an_evaluation_has_its_own_environment_again_if_learning_does_not_start(at):
+    eval_env = normalised(training=False)
+    evaluation = EvalCallback(eval_env, verbose=0)
+    model = agent(normalised())
+    with pytest.raises(ValueError, match="refused"):
+        model.learn(28, callback=[evaluation, Refusing(at)])
+    assert evaluation.eval_env is eval_env
 
 
 @pytest.mark.filterwarnings("ignore:Evaluation environment")

@@ -1,6 +1,7 @@
 """Bad input: each error names the culprit and the remedy, and nothing is lost."""
 
 import inspect
+import re
 from dataclasses import asdict
 
 import gymnasium as gym
@@ -18,6 +19,7 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.sizes import SIZES
 from wpt_agents.training import cloning, learner, pretraining, world_model_learner
 from wpt_agents.training.hyperparameters import SIZES_OWN, Hyperparameters
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 
 
@@ -43,7 +45,7 @@ class Odd(ClockEnv):
         (Odd(action=spaces.Discrete(3)), r"Discrete\(3\): wrap it .*TransformAction"),
         (Odd(action=spaces.Box(-1, 1, (2, 2))), r"one-dimensional Box, .*\(2, 2\)"),
         (Odd(action=spaces.Box(-np.inf, 1, (2,))), "finite bounds, .*TransformAction"),
-        (ClockEnv(actions=5), "5 actions, .* max_action_dim=4: pre-train with a larger"),
+        (ClockEnv(actions=5), "5 actions, .* max_action_dim=4: make it with max_action_dim=5"),
         (Odd(spaces.Box(-1, 1, (17,))), "sees images, .*17.*AddRenderObservation"),
         (Odd(spaces.Box(0, 1, (64, 64, 3))), "sees images, .*float32.*convert them: .*255"),
         (Odd(spaces.Box(0, 255, (64, 64, 2), np.uint8)), r"sees images, .*\(64, 64, 2\)"),
@@ -60,9 +62,38 @@ def test_an_environment_that_does_not_fit_is_refused(env, words):
         agent(env)
 
 
+def test_a_pretrained_model_is_to_be_pretrained_again_for_more_actions(tmp_path):
+    words = "max_action_dim=4: pre-train with a larger max_action_dim"
+    model = pretrained([recorded()])
+    with pytest.raises(ValueError, match=words):
+        model.set_env(ClockEnv(actions=5))
+    model.save_world_model(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=words):
+        WPT.load(tmp_path / "model.zip", env=ClockEnv(actions=5))
+
+
+def test_pretraining_for_an_environment_of_more_actions_names_the_keyword_before_it_begins():
+    with pytest.raises(ValueError, match="max_action_dim=4: make it with max_action_dim=5"):
+        pretrained([recorded()], env=ClockEnv(actions=5))
+
+
 def test_learning_without_an_environment_says_how_to_give_one():
     with pytest.raises(ValueError, match=r"call set_env\(env\), or pass env="):
         agent().learn(10)
+
+
+@pytest.mark.parametrize("steps", ["100", True, 1.5, -1, np.nan, np.inf, None])
+def test_learn_refuses_what_is_no_number_of_steps_and_changes_nothing(steps):
+    model = agent(ClockEnv()).learn(7)
+    got = re.escape(f"at least 0, got {steps!r}: pass the number of steps to collect, such as")
+    with pytest.raises(ValueError, match=f"total_timesteps must be a whole number of {got}"):
+        model.learn(steps)
+    assert model.num_timesteps == 7
+
+
+@pytest.mark.parametrize("steps", [1e1, np.int64(10), np.float32(10)])
+def test_a_whole_number_of_steps_may_be_of_any_type(steps):
+    assert agent(ClockEnv()).learn(steps).num_timesteps == 10
 
 
 def test_an_unknown_environment_is_named():
@@ -374,10 +405,10 @@ def test_what_open_loop_cannot_show_is_refused_by_name():
 
 def test_a_plan_with_such_a_value_is_refused_before_anything_is_made(tmp_path):
     with pytest.raises(ValueError, match="gamma must be a number in"):
-        make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], ["gamma=high"], tmp_path, 1, "cpu")
+        make_plan("dmc", ["walker-run"], Request("debug", settings=["gamma=high"], out=tmp_path))
 
 
 @pytest.mark.parametrize("task", ["metaworld-drawer-close", "drawer-close"])
 def test_a_task_of_another_suite_is_told_its_suite(tmp_path, task):
     with pytest.raises(ValueError, match=r"of the suite metaworld: (pass )?--suite metaworld"):
-        make_plan("dmc", [task], "debug", "1", ["wpt"], [], tmp_path, 1, "cpu")
+        make_plan("dmc", [task], Request("debug", out=tmp_path))

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import gymnasium as gym
 import pytest
-from debug_agent import ClockEnv, agent
+from debug_agent import ClockEnv, agent, pretrained, recorded
 from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_env import DotEnv
 
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.training.outlook import Outlook
@@ -134,6 +135,21 @@ def test_a_warm_up_that_outlasts_the_call_is_named_twice(steps):
 def test_nothing_is_said_of_a_call_that_learns_or_is_told_not_to():
     assert not said(agent(ClockEnv(), **SCRATCH), 40)
     assert not said(agent(ClockEnv(), **SCRATCH | {"train_ratio": 0}), 40)
+
+
+@pytest.mark.parametrize("make", [lambda: agent(ClockEnv(), **SCRATCH), lambda: drqv2()])
+def test_learn_0_makes_no_step_and_says_nothing(make):
+    model = make()
+    assert not said(model, 0) and model.learn(0) is model
+    assert model.num_timesteps == model.updates == model.episodes == 0
+    model.learn(40)
+    assert not said(model, 0, reset_num_timesteps=False) and model.num_timesteps == 40
+
+
+def test_learn_0_retrieves_and_trains_the_prior_actor():
+    model = pretrained([recorded(seed=seed) for seed in range(4)], env=DotEnv())
+    assert not said(model, 0) and model.num_timesteps == 0
+    assert len(model.retrieved_ids) == 3 and model.prior is not None
 
 
 def test_short_calls_that_continue_a_run_are_not_warned_of():

@@ -40,8 +40,8 @@ from wpt_agents.agents.saved import SavedAgent
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import to_images
-from wpt_agents.training.checks import check_rewards
-from wpt_agents.training.evaluations import show_same_entry
+from wpt_agents.training.checks import check_rewards, whole_steps
+from wpt_agents.training.evaluations import showing_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.resets import resets
@@ -117,14 +117,17 @@ class PixelAgent(SavedAgent):
     ) -> Self:
         """Collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. 0
+            makes no step and no update, but the preparations for them, such as reading offline
+            data
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :param tb_log_name: name of the run's folder in `tensorboard_log`
         :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
         :param progress_bar: show a progress bar
         :return: the agent itself
-        :raises ValueError: no environment, or rewards that are not finite
+        :raises ValueError: no environment, `total_timesteps` that are no whole number of at least
+            0, or rewards that are not finite
         :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with self.learning(
@@ -147,33 +150,32 @@ class PixelAgent(SavedAgent):
         """Set up what `learn` needs, reset the environment, call the first and last callback."""
         if self.env is None:
             raise ValueError("No environment: call set_env(env), or pass env= to pretrain or load")
+        total_timesteps = whole_steps(total_timesteps)
         if reset_num_timesteps:
             self.progress.restart_steps()
         if resets(self.env) != self._resets_seen:
             self._last_obs = None  # an evaluation, for example, has ended the open episodes
-        eval_envs = show_same_entry(callback, self.env)
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        self._resets_seen = resets(self.env)
-        if self.verbose:
-            print(self)
-        updates_before = self.updates
-        # What earlier steps paid for is kept, so that short calls in a row learn, too.
-        begun = self.num_timesteps >= self.learning_starts and len(self.replay_buffer) > 0
-        continued = begun and not reset_num_timesteps
-        outlook = Outlook.of(self)
-        outlook.warn(over=False, learns=continued)
-        callback.on_training_start(locals(), globals())
-        try:
-            yield callback
-        except BaseException:
-            self._last_obs = None  # open episodes may lack a step: the next call begins new ones
-            raise
-        finally:
-            callback.on_training_end()
-            for evaluator, env in eval_envs.items():
-                evaluator.eval_env = env
+        with showing_same_entry(callback, self.env):
+            total_timesteps, callback = self._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            )
+            self._resets_seen = resets(self.env)
+            if self.verbose:
+                print(self)
+            updates_before = self.updates
+            # What earlier steps paid for is kept, so that short calls in a row learn, too.
+            begun = self.num_timesteps >= self.learning_starts and len(self.replay_buffer) > 0
+            continued = begun and not reset_num_timesteps
+            outlook = Outlook.of(self)
+            outlook.warn(over=False, learns=continued)
+            callback.on_training_start(locals(), globals())
+            try:
+                yield callback
+            except BaseException:
+                self._last_obs = None  # open episodes may lack a step, so new ones begin
+                raise
+            finally:
+                callback.on_training_end()
         outlook = replace(outlook, stop=self.num_timesteps, replay=len(self.replay_buffer) > 0)
         outlook.warn(over=True, learns=continued or self.updates > updates_before)
 

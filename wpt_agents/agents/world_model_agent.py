@@ -218,7 +218,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
 
     def check_env(self, env: VecEnv) -> None:
         """Refuse an environment that WPT cannot act in."""
-        check_spaces(env, self.hyperparameters.max_action_dim)
+        check_spaces(env, self.hyperparameters.max_action_dim, self.progress.initialised)
 
     def check_units(self) -> None:
         """Warn if the environment's actions are in other units than those of the dataset."""

@@ -150,14 +150,16 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     ) -> Self:
         """Fine-tune on the task (Algorithm 1): retrieve, clone, then collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. 0
+            makes no step and no update: it only retrieves, and trains the prior actor
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :param tb_log_name: name of the run's folder in `tensorboard_log`
         :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
         :param progress_bar: show a progress bar of each stage
         :return: the model itself
-        :raises ValueError: no environment, or rewards that are not finite
+        :raises ValueError: no environment, `total_timesteps` that are no whole number of at least
+            0, or rewards that are not finite
         :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with (

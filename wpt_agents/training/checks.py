@@ -1,10 +1,13 @@
 """Refuse what agents cannot learn from; every error names the culprit and the remedy."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
+from wpt_agents.training.keywords import is_number
 from wpt_agents.training.spaces import IMAGE_SHAPE
 
 
@@ -62,6 +65,16 @@ def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) 
             f"The trajectory has {trajectory.action_dim} actions, the model takes at most "
             f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
         )
+
+
+def whole_steps(total_timesteps: Any) -> int:
+    """Return the steps that `learn` is called with as an int; refuse what is no number of steps."""
+    if is_number(total_timesteps) and total_timesteps >= 0 and total_timesteps % 1 == 0:
+        return int(total_timesteps)  # 2e4, too
+    raise ValueError(
+        f"total_timesteps must be a whole number of at least 0, got {total_timesteps!r}: pass the "
+        "number of steps to collect, such as learn(10_000)"
+    )
 
 
 def check_rewards(rewards: np.ndarray, step: int) -> None:

@@ -1,6 +1,7 @@
 """Callbacks that evaluate on the same entry of Dict observations as the agent sees."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from gymnasium import spaces
@@ -18,21 +19,25 @@ def evaluators(callback: Any) -> Iterator[EvalCallback]:
             yield from evaluators(part)
 
 
-def show_same_entry(callback: Any, env: VecEnv) -> dict[EvalCallback, VecEnv]:
+@contextmanager
+def showing_same_entry(callback: Any, env: VecEnv) -> Iterator[None]:
     """Wrap the environments of EvalCallbacks as the agent's is, so that both show the same entry.
 
     SB3 warns if they differ in type, and copies the averages of VecNormalize wrapper by wrapper.
+    At the end, also after an error, the callbacks have their own environments again.
 
     :param callback: what `learn` takes
     :param env: the agent's environment
-    :return: the environments before, by callback
     """
     before: dict[EvalCallback, VecEnv] = {}
-    if not isinstance(env, VecExtractDictObs):
-        return before
-    for evaluator in evaluators(callback):
-        space = evaluator.eval_env.observation_space
-        if isinstance(space, spaces.Dict) and env.key in space.spaces:
-            before[evaluator] = evaluator.eval_env
-            evaluator.eval_env = VecExtractDictObs(evaluator.eval_env, env.key)
-    return before
+    try:
+        if isinstance(env, VecExtractDictObs):
+            for evaluator in evaluators(callback):
+                space = evaluator.eval_env.observation_space
+                if isinstance(space, spaces.Dict) and env.key in space.spaces:
+                    before[evaluator] = evaluator.eval_env
+                    evaluator.eval_env = VecExtractDictObs(evaluator.eval_env, env.key)
+        yield
+    finally:
+        for evaluator, eval_env in before.items():
+            evaluator.eval_env = eval_env

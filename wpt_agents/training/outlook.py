@@ -73,6 +73,8 @@ class Outlook:
 
         :param learns: whether it has made updates, or need not make any
         """
+        if not self.steps:  # nobody expects updates of learn(0)
+            return
         expected = not learns and self.price < math.inf
         for text in (self.no_update(over) if expected else None, self.warm_up_only()):
             if text is not None:

@@ -23,13 +23,14 @@ RENDER = (
 )
 
 
-def check_spaces(env: VecEnv, max_action_dim: int | None = None) -> None:
+def check_spaces(env: VecEnv, max_action_dim: int | None = None, trained: bool = False) -> None:
     """Refuse an environment that an agent cannot act in; warn where images will be changed.
 
     :param max_action_dim: the largest number of actions, or None for any
+    :param trained: whether a new model with another `max_action_dim` must be trained first
     """
     check_observations(env)
-    check_actions(env.action_space, max_action_dim)
+    check_actions(env.action_space, max_action_dim, trained)
 
 
 # ------------------------------------------------------------------------------- observations
@@ -164,7 +165,9 @@ def _crop(height: int, width: int, channels: int, channels_last: bool) -> str:
 # ------------------------------------------------------------------------------------ actions
 
 
-def check_actions(space: spaces.Space[Any], max_action_dim: int | None) -> None:
+def check_actions(
+    space: spaces.Space[Any], max_action_dim: int | None, trained: bool = False
+) -> None:
     """Refuse actions that are no flat Box with finite bounds, or that are too many."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(
@@ -178,10 +181,12 @@ def check_actions(space: spaces.Space[Any], max_action_dim: int | None) -> None:
             f"reach, for example from -1 to 1, by {_act('action', space.shape[0])}. "
             "gymnasium's ClipAction also hides the bounds; leave it out, as the agent keeps to them"
         )
-    if max_action_dim is not None and space.shape[0] > max_action_dim:
+    width = space.shape[0]
+    if max_action_dim is not None and width > max_action_dim:
+        larger = "pre-train with a larger max_action_dim"
         raise ValueError(
-            f"The environment has {space.shape[0]} actions, the model was made for at most "
-            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
+            f"The environment has {width} actions, the model was made for at most max_action_dim="
+            f"{max_action_dim}: {larger if trained else f'make it with max_action_dim={width}'}"
         )
 
 

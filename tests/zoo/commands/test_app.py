@@ -12,6 +12,7 @@ from zoo_command import call
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.commands import app as command_line
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.report import record
 from wpt_agents.zoo.result import Variant
@@ -183,7 +184,7 @@ def test_a_dry_run_tells_of_a_folder_with_other_settings_too(monkeypatch, capsys
     words = ["--tasks", "walker-run", "--preset", "debug", "--out", tmp_path]
     folder = tmp_path / "debug" / "wpt" / "dmc-walker-run_0"
     folder.mkdir(parents=True)
-    [one] = make_plan("dmc", ["walker-run"], "debug", "1", ["wpt"], [], tmp_path, 2, "auto")
+    [one] = make_plan("dmc", ["walker-run"], Request("debug", out=tmp_path))
     (folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
     assert call(monkeypatch, "run", *words, "--dry-run") == 0
     assert call(monkeypatch, "run", *words, "--dry-run", "--set", "gamma=0.9") == 2

@@ -132,7 +132,7 @@ def test_a_moved_out_is_not_done_again(tmp_path):
     ("words", "message"),
     [
         (["eval", "nowhere"], "There is no nowhere"),
-        (["enjoy", "empty"], "holds no model.zip"),
+        (["enjoy", "empty"], "empty holds no run: name a run folder, or a model file (.zip)"),
         (["eval", "alone.zip"], "add --task"),
         (["eval", "run", "--task", "dmc-walker-rum"], "Did you mean 'walker-run'"),
         (["eval", "run", "--task", "dmc-walker-*"], "matches 7 tasks: name one"),
@@ -140,7 +140,7 @@ def test_a_moved_out_is_not_done_again(tmp_path):
         (["enjoy", "run", "--out", "film.avi"], "end in .mp4 or .gif"),
         (["eval", "damaged"], "is not the configuration of a run"),
         (["push", "run", "noname"], "write user/name"),
-        (["push", "empty", "user/name"], "holds no model.zip"),
+        (["push", "empty", "user/name"], "empty holds no run"),
         (["pull", "user/name", "--out", "run"], "is not empty"),
     ],
 )
@@ -173,6 +173,18 @@ def test_a_task_of_a_sequence_is_played_as_the_sequence_was(tmp_path, monkeypatc
     assert find_trained(Path("model.zip")).task == tasks[1]
     assert call(monkeypatch, "eval", tmp_path / "ant_0") == 2
     assert "name one in it: dmc-quadruped-walk" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "more"), [(1, ""), (5, ""), (7, ", and 2 more")])
+def test_a_folder_of_runs_is_not_called_an_unfinished_run(number, more, tmp_path):
+    runs = [make_run(tmp_path / "runs", "dmc-walker-run", seed) for seed in range(number)]
+    names = ", ".join(map(str, runs[:5]))
+    for folder in (tmp_path / "runs", runs[0].parent):
+        with pytest.raises(FileNotFoundError) as raised:
+            find_trained(folder)
+        assert str(raised.value) == f"{folder} holds no run: name one below it: {names}{more}"
+    with pytest.raises(FileNotFoundError, match=r"model\.zip: the run is not finished"):
+        find_trained(runs[0])  # it has no model yet
 
 
 def test_the_hub_is_asked_for_only_when_needed_and_told_if_missing(tmp_path, monkeypatch, capsys):

@@ -1,5 +1,7 @@
 """A look at the data: the table's numbers, and that the pictures show what they say."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -119,6 +121,32 @@ def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, mon
     assert (30, 30, 30) not in shown  # no dot
     assert call(monkeypatch, "retrieve", "show", *words) == 0
     assert (30, 30, 30) in colours(tmp_path / "found.png")
+
+
+@pytest.mark.parametrize(
+    ("label", "words", "rendering"),
+    [
+        (None, [], "near"),
+        ({"env": {}}, [], "near"),
+        ({"env": {"rendering": "fast"}}, [], "fast"),
+        ({"env": {"rendering": "fast"}}, ["--rendering", "exact"], "exact"),
+    ],
+)
+def test_a_task_is_rendered_as_the_data_were_by_default(
+    dataset, label, words, rendering, tmp_path, monkeypatch
+):
+    agent(DotEnv()).save(tmp_path / "model.zip")
+    if label is not None:
+        (dataset.path / "collect.json").write_text(json.dumps(label))
+    used = []
+    query = retrieval.query_of(dataset, 3)
+    monkeypatch.setattr(retrieval, "query_at", lambda _, env: used.append(env) or query)
+    shares = "wpt_agents.zoo.judge.retrieved.own_task_shares"
+    monkeypatch.setattr(shares, lambda *args: used.append(args[4]) or [])
+    words = [dataset.path, "--model", tmp_path, "--task", "dot", *words]
+    assert call(monkeypatch, "retrieve", "show", *words, "--out", tmp_path / "found.png") == 0
+    assert call(monkeypatch, "retrieve", "share", *words, "--suite", "dmc") == 0
+    assert used == [{"rendering": rendering}] * 2
 
 
 def test_the_share_of_the_own_task_counts_what_the_index_finds(tmp_path, monkeypatch, capsys):

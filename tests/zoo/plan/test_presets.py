@@ -21,6 +21,7 @@ from wpt_agents.zoo.plan.presets import (
     read_yaml,
     suite_names,
 )
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan, parse_seeds
 from wpt_agents.zoo.run.learning import make_agent
 from wpt_agents.zoo.tasks import find_tasks
@@ -213,7 +214,8 @@ def test_the_authors_own_numbers_name_repository_and_commit():
 
 
 def plan(suite, tasks, preset, tmp_path, method="wpt", settings=(), data=None):
-    return make_plan(suite, tasks, preset, "1", [method], settings, tmp_path, 1, "cpu", data)
+    request = Request(preset, methods=[method], settings=settings, out=tmp_path, data=data)
+    return make_plan(suite, tasks, request)
 
 
 @pytest.mark.parametrize("suite", suite_names())
@@ -241,8 +243,8 @@ def test_every_method_can_be_planned_from_every_preset(method, tmp_path):
 def test_all_methods_have_the_same_frames_evaluations_and_choice_of_the_best_policy(
     suite, preset, tmp_path
 ):
-    where = suite, [TASK_OF[suite]], preset, "7-7", list(METHODS), []
-    runs = make_plan(*where, tmp_path, 1, "cpu")
+    request = Request(preset, "7-7", list(METHODS), out=tmp_path)
+    runs = make_plan(suite, [TASK_OF[suite]], request)
     assert [run.method for run in runs] == list(METHODS)
     budgets = {(run.preset.learn, run.preset.evaluate, run.evaluation_seed) for run in runs}
     assert len(budgets) == 1
@@ -365,8 +367,8 @@ def test_what_a_run_would_stumble_over_or_overrule_is_refused_beforehand(
 
 def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_path):
     methods, settings = ["scratch", "scratch"], ["gamma=0.98", "gamma=0.9"]
-    arguments = "dmc", ["walker-run"], "debug", "1", methods, settings
-    [one] = make_plan(*arguments, tmp_path, 1, "cpu")
+    request = Request("debug", methods=methods, settings=settings, out=tmp_path)
+    [one] = make_plan("dmc", ["walker-run"], request)
     assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
 
 
@@ -406,8 +408,8 @@ def test_settings_that_a_shipped_model_makes_void_are_refused_with_a_remedy_that
 
 def test_a_setting_that_affects_one_of_the_methods_is_allowed(tmp_path):
     settings = ["sac.gamma=0.5", "plus.actor_delay=9"]
-    arguments = "dmc", ["walker-run"], "debug", "1", ["wpt", "wpt+", "sac"], settings
-    assert len(make_plan(*arguments, tmp_path, 1, "cpu")) == 3
+    request = Request("debug", "1", ["wpt", "wpt+", "sac"], settings, tmp_path)
+    assert len(make_plan("dmc", ["walker-run"], request)) == 3
 
 
 def test_settings_of_the_presets_data_are_refused_with_data_of_ones_own(tmp_path):

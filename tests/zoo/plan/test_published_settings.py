@@ -4,6 +4,7 @@ import pytest
 from stable_baselines3 import SAC
 
 from wpt_agents.zoo.plan.methods import defaults
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 
 COMMON = {"gamma": 0.99, "batch_size": 256, "pad": 4}
@@ -105,6 +106,6 @@ PUBLISHED = {
 @pytest.mark.parametrize(("suite", "task"), [("dmc", "walker-run"), ("metaworld", "drawer-open")])
 @pytest.mark.parametrize("method", PUBLISHED)
 def test_the_paper_preset_has_the_published_settings(method, suite, task, tmp_path):
-    [run] = make_plan(suite, [task], "paper", "1", [method], [], tmp_path, 1, "cpu")
+    [run] = make_plan(suite, [task], Request("paper", methods=[method], out=tmp_path))
     settings = run.full_keywords
     assert {name: settings[name] for name in PUBLISHED[method]} == PUBLISHED[method]

@@ -31,6 +31,7 @@ from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.overview import identity_of
 from wpt_agents.zoo.plan.presets import load_preset
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan
 from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.provenance import commit
@@ -404,10 +405,9 @@ def test_evaluations_and_training_start_from_different_seeds(tmp_path):
     assert all(100 < seed < 2**31 - 100 for seed in seeds)
 
 
-def test_runs_of_a_changed_preset_are_told_apart(tmp_path):
-    arguments = "dmc", ["walker-stand"], "debug", "1", ["wpt"]
+def test_runs_of_a_changed_preset_are_told_apart():
     plain, changed, longer = (
-        str(make_plan(*arguments, settings, tmp_path, 1, "cpu")[0].variant)
+        str(make_plan("dmc", ["walker-stand"], Request("debug", settings=settings))[0].variant)
         for settings in ([], ["gamma=0.9", "env.rendering=near"], ["learn.frames=9000"])
     )
     assert (plain, changed, longer) == ("debug", "debug env.rendering=near gamma=0.9", "debug")

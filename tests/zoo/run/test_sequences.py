@@ -17,6 +17,7 @@ from wpt_agents.agents.packnet import PackNet
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import read_model
 from wpt_agents.zoo.plan.presets import load_preset, preset_names
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.sequences import SequenceRun, find_sequence, make_sequences
 from wpt_agents.zoo.run import learning, sequences
 from wpt_agents.zoo.run.sequences import run_sequence, run_sequences
@@ -154,7 +155,7 @@ def test_a_sequence_that_fails_is_reported_and_stops_no_other(tmp_path, monkeypa
 @pytest.mark.parametrize("method", ["wpt", "packnet"])
 @pytest.mark.parametrize("preset", ["debug", "tiny", "mid", "paper"])
 def test_the_ant_sequence_can_be_planned_from_every_preset(method, preset, tmp_path):
-    (one,) = make_sequences("ant", preset, "1", [method], [], tmp_path, 1, "cpu")
+    (one,) = make_sequences("ant", Request(preset, methods=[method], out=tmp_path))
     assert [run.task.name for run in one.runs] == list(find_sequence("ant").tasks)
     assert one.runs[0].preset.collect.tasks == ("dmc-quadruped-run",)
     assert not one.runs[0].preset.evaluate.keep_best
@@ -174,7 +175,7 @@ def test_the_ant_sequence_of_the_paper_has_300_000_frames_a_task_and_a_small_wor
 
 def test_methods_that_learn_single_tasks_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"drq-v2 learns single tasks; .* wpt, .* packnet"):
-        make_sequences("ant", "debug", "1", ["drq-v2"], [], tmp_path, 1, "cpu")
+        make_sequences("ant", Request("debug", methods=["drq-v2"], out=tmp_path))
     with pytest.raises(ValueError, match="ants"):
         find_sequence("ants")
 
@@ -192,7 +193,7 @@ def test_the_command_shows_the_plan_and_refuses_what_does_not_go_together(
 def test_a_dry_run_tells_of_a_sequence_with_other_settings(tmp_path, monkeypatch, capsys):
     words = ["run", "--sequence", "ant", "--method", "packnet", "--preset", "debug"]
     words += ["--dry-run", "--out", tmp_path]
-    [one] = make_sequences("ant", "debug", "1", ["packnet"], [], tmp_path, 2, "auto")
+    [one] = make_sequences("ant", Request("debug", methods=["packnet"], out=tmp_path))
     one.folder.mkdir(parents=True)
     (one.folder / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(one.config()))))
     assert call(monkeypatch, *words) == 0

@@ -48,57 +48,33 @@ def report(
     from rich.markup import escape
 
     from wpt_agents.zoo.report import record as records
-    from wpt_agents.zoo.report import record_page, tables
-    from wpt_agents.zoo.report.figure4 import (
-        figures_4,
-        find_sequences,
-        sequence_markdown,
-        sequence_table,
-    )
-    from wpt_agents.zoo.report.folders import find_finished, find_unfinished, unfinished_text
-    from wpt_agents.zoo.report.page import check_media, write_page
-    from wpt_agents.zoo.report.steadiness import markdown as steadiness_markdown
-    from wpt_agents.zoo.report.steadiness import steadiness
+    from wpt_agents.zoo.report import record_page
+    from wpt_agents.zoo.report.page import check_media
+    from wpt_agents.zoo.report.summary import Summary
     from wpt_agents.zoo.terminal import console
-    from wpt_agents.zoo.text_files import write_atomically
 
     if record is not None:
         record_page.check(record)
     check_media(media)
-    runs = find_finished(folder)
-    results = [run.result for run in runs]
-    sequences = figures_4(find_sequences(folder))
-    if not results and record is not None and record.exists() and records.read(record):
+    summary = Summary.of(folder)
+    if not summary.runs and record is not None and record.exists() and records.read(record):
         record_page.renew(record)
         console.print(
             f"No finished run below {folder}: {record} stays, its pages are renewed.", markup=False
         )
-        if not sequences:
+        if not summary.sequences:
             return
-    if not results and not sequences:
+    if not summary.runs and not summary.sequences:
         raise ValueError(f"No finished run below {folder}: there is no readable result.json.")
-    rows = tables.summarise(results)
-    policies = tables.policies(results)
-    parts = [tables.markdown(rows), tables.policy_markdown(policies)] if rows else []
-    missing = unfinished_text(find_unfinished(folder))
-    parts += [steadiness_markdown(steadiness(runs)), sequence_markdown(sequences), missing]
-    as_markdown = "\n".join(filter(None, parts))
-    if record is not None and results:
-        record_page.add(record, runs)
+    if record is not None and summary.runs:
+        record_page.add(record, summary.runs)
     if csv:
-        typer.echo(tables.policy_csv(policies), nl=False)
+        typer.echo(summary.csv(), nl=False)
     elif markdown:
-        typer.echo(as_markdown, nl=False)
+        typer.echo(summary.markdown(), nl=False)
     else:
         page = (out or folder / "report") / "index.html"
-        write_page(folder, page, media, runs)
-        write_atomically(page.with_name("report.md"), as_markdown)
-        write_atomically(page.with_name("policies.csv"), tables.policy_csv(policies))
-        if rows:
-            console.print(tables.summary_table(rows))
-        if sequences:
-            console.print(sequence_table(sequences))
-        if missing:
-            console.print(missing, markup=False)
+        summary.write(page, media)
+        summary.show()
         where = escape(str(page.resolve()))
         console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")

@@ -16,6 +16,14 @@ retrieve = typer.Typer(no_args_is_help=True, help=HELP)
 
 
 Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
+TaskRendering = Annotated[
+    Rendering | None,
+    typer.Option(
+        help="The quality of the images of --task; by default that with which `collect` or `run` "
+        "made the data, or near for other data.",
+        show_default=False,
+    ),
+]
 
 
 def show_retrieval(
@@ -36,9 +44,7 @@ def show_retrieval(
         typer.Option(help="Tasks whose first images are the queries."),
     ] = [],  # noqa: B006
     suite: Suite = "dmc",
-    rendering: Annotated[
-        Rendering, typer.Option(help="The quality of the images of --task.")
-    ] = Rendering.near,
+    rendering: TaskRendering = None,
     number: Annotated[
         int, typer.Option(min=1, help="The number of nearest trajectories to show.")
     ] = 8,
@@ -64,7 +70,8 @@ def show_retrieval(
     assert agent.dataset is not None
     queries = [retrieval.query_of(agent.dataset, i) for i in query]
     rows = find_tasks(suite, task) if task else []
-    queries += [retrieval.query_at(row, {"rendering": str(rendering)}) for row in rows]
+    look = _look(folder, rendering)
+    queries += [retrieval.query_at(row, look) for row in rows]
     if not queries:
         chosen = datasets.spread(agent.dataset, 6)
         queries = [retrieval.query_of(agent.dataset, i) for i in chosen]
@@ -84,9 +91,7 @@ def share_retrieval(
     ],
     task: Annotated[list[str], typer.Option(help="Tasks whose first images are the queries.")],
     suite: Suite = "metaworld",
-    rendering: Annotated[
-        Rendering, typer.Option(help="The quality of the images of the tasks.")
-    ] = Rendering.near,
+    rendering: TaskRendering = None,
     number: Annotated[int, typer.Option(min=1, help="The number of retrieved trajectories.")] = 40,
     images: Annotated[
         list[int], typer.Option(min=1, help="The number of first images of the task to compare.")
@@ -104,7 +109,16 @@ def share_retrieval(
     from wpt_agents.zoo.tasks import find_tasks
 
     agent = WPT.load(model_file(model), dataset=folder)
-    look = {"rendering": str(rendering)}
+    look = _look(folder, rendering)
     typer.echo(f"{'first images':28}" + "".join(f"{count:7}" for count in images))
     for name, shares in own_task_shares(agent, find_tasks(suite, task), images, number, look, seed):
         typer.echo(f"{name:28}" + "".join(f"{share:7.2f}" for share in shares))
+
+
+def _look(folder: Path, rendering: Rendering | None) -> dict[str, str]:
+    """Return the keyword arguments of `gymnasium.make` for images like those of a dataset."""
+    from wpt_agents.zoo.collect.collection import read_label
+
+    if rendering is not None:
+        return {"rendering": str(rendering)}
+    return {"rendering": read_label(folder).get("env", {}).get("rendering", "near")}

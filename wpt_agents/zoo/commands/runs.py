@@ -1,5 +1,6 @@
 """The commands that plan and execute runs: list, pretrain, run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -232,9 +233,9 @@ def run_benchmark(
 
     from wpt_agents.training.distributed import started_by_torchrun
     from wpt_agents.zoo.plan.presets import load_preset
+    from wpt_agents.zoo.plan.request import Request
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
-    from wpt_agents.zoo.report import record_page
     from wpt_agents.zoo.run.dispatch import check_resources, do_plan, do_sequences, preview
     from wpt_agents.zoo.run.engines import Resources
     from wpt_agents.zoo.run.watch import watch as show_standings
@@ -245,6 +246,7 @@ def run_benchmark(
     preset_suite = find_sequence(sequence).suite if sequence else suite
     if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
+    request = Request(preset, seeds, method, changes, out, workers, device, data)
     resources = Resources(
         workers=workers,
         cpus=cpus,
@@ -256,24 +258,29 @@ def run_benchmark(
         partition=partition,
     )
     check_resources(engine, resources)
+    _check_combination(sequence, tasks, watch, engine, record)
+    if sequence:
+        if not do_sequences(make_sequences(sequence, request), force, dry_run):
+            raise typer.Exit(1)
+        return
+    runs = [replace(run, record=record) for run in make_plan(suite, tasks, request)]
+    if watch:
+        show_standings(runs)
+    elif dry_run:
+        preview(runs, engine, force)
+    elif not do_plan(runs, engine, force, resources):
+        raise typer.Exit(1)
+
+
+def _check_combination(
+    sequence: str, tasks: Sequence[str], watch: bool, engine: str, record: Path | None
+) -> None:
+    """Raise an error for options that exclude each other, or for a path that is no record."""
+    from wpt_agents.zoo.report import record_page
+
     if record is not None:
         if sequence or watch:
             raise ValueError("--record cannot be combined with --sequence or --watch")
         record_page.check(record)
-    if sequence:
-        if tasks or watch or engine != "none":
-            raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")
-        jobs = make_sequences(sequence, preset, seeds, method, changes, out, workers, device, data)
-        if not do_sequences(jobs, force, dry_run):
-            raise typer.Exit(1)
-        return
-    plan = make_plan(suite, tasks, preset, seeds, method, changes, out, workers, device, data)
-    runs = [replace(run, record=record) for run in plan]
-    if watch:
-        show_standings(runs)
-        return
-    if dry_run:
-        preview(runs, engine, force)
-        return
-    if not do_plan(runs, engine, force, resources):
-        raise typer.Exit(1)
+    if sequence and (tasks or watch or engine != "none"):
+        raise ValueError("--sequence cannot be combined with --tasks, --watch or --engine")

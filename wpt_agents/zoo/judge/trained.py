@@ -26,6 +26,7 @@ from wpt_agents.zoo.tasks import find_tasks
 
 POLICIES = ("wpt", "prior")  # "wpt" is the agent of any method
 FILMS = (".mp4", ".gif")
+MOST_NAMED = 5  # run folders that an error message names
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,21 @@ def final_model(folder: Path) -> Path:
     for name in ("best_model.zip", "model.zip"):
         if (folder / name).exists():
             return folder / name
+    if read_origin(folder) is None:
+        raise FileNotFoundError(f"{folder} holds no run: {_runs_below(folder)}")
     if names := sorted(path.parent.name for path in folder.glob("*/model.zip")):
         raise FileNotFoundError(f"{folder} holds no model.zip; name one in it: {', '.join(names)}")
     raise FileNotFoundError(f"{folder} holds no model.zip: the run is not finished")
+
+
+def _runs_below(folder: Path) -> str:
+    """Return what to name instead of a folder that is no run folder: up to five below it."""
+    runs = {path.parent for name in ("**/config.yaml", "*/model.zip") for path in folder.glob(name)}
+    if not runs:
+        return "name a run folder, or a model file (.zip)"
+    names = ", ".join(map(str, sorted(runs)[:MOST_NAMED]))
+    rest = len(runs) - MOST_NAMED
+    return f"name one below it: {names}" + (f", and {rest} more" if rest > 0 else "")
 
 
 @dataclass(frozen=True)

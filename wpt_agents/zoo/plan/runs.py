@@ -23,6 +23,7 @@ from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY
 from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shape
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
@@ -184,52 +185,45 @@ def parse_seeds(text: str) -> list[int]:
 def make_plan(
     suite: str,
     tasks: Sequence[str],
-    preset: str,
-    seeds: str,
-    methods: Sequence[str],
-    settings: Sequence[str],
-    out: Path,
-    workers: int,
-    device: str,
-    data: Path | None = None,
+    request: Request,
     sections: Sequence[Mapping[str, Mapping[str, Any]]] = (),
 ) -> list[Run]:
     """Return one run for each task, method and seed.
 
-    :param sections: changes to the preset, applied before those of `settings`
+    :param sections: changes to the preset, applied before those of `request.settings`
     :raises ValueError: if a name or setting is invalid
     """
     rows = find_tasks(suite, tasks)
-    resolved = load_preset(suite, preset, settings, sections)
+    preset = load_preset(suite, request.preset, request.settings, sections)
     for row in rows:
         if row.suite != suite:
             raise ValueError(f"{short_name(row)} is of the suite {row.suite}: --suite {row.suite}")
-    check_preset(resolved)
-    changes = effective_changes(settings)
-    names = list(dict.fromkeys(methods))
-    for name in names:
-        check_changes(name, changes)
-    check_effects(changes, names, resolved, data)
-    check_shape(resolved, load_preset(suite, preset, (), sections), names)
+    check_preset(preset)
+    changes = effective_changes(request.settings)
+    methods = list(dict.fromkeys(request.methods))
+    for method in methods:
+        check_changes(method, changes)
+    check_effects(changes, methods, preset, request.data)
+    check_shape(preset, load_preset(suite, request.preset, (), sections), methods)
     runs = [
         Run(
             task=row,
             seed=seed,
-            method=name,
-            preset_name=preset,
-            preset=resolved,
-            out=out,
-            workers=workers,
-            device=device,
-            data=data,
+            method=method,
+            preset_name=request.preset,
+            preset=preset,
+            out=request.out,
+            workers=request.workers,
+            device=request.device,
+            data=request.data,
             changes=changes,
-            data_name=str(data or ""),
+            data_name=str(request.data or ""),
         )
         for row in rows
-        for name in names
-        for seed in parse_seeds(seeds)
+        for method in methods
+        for seed in parse_seeds(request.seeds)
     ]
-    widths = action_widths(suite, resolved, data)
+    widths = action_widths(suite, preset, request.data)
     for run in runs:
         check_width(run, widths)
     return runs

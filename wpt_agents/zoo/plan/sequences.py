@@ -11,6 +11,7 @@ from typing import Any
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.plan.methods import METHODS, find_method
 from wpt_agents.zoo.plan.presets import preset_folder, read_yaml
+from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import Run, make_plan
 
 
@@ -81,35 +82,20 @@ def able_methods() -> list[str]:
     return [name for name, method in METHODS.items() if hasattr(method.agent, "next_task")]
 
 
-def make_sequences(
-    name: str,
-    preset: str,
-    seeds: str,
-    methods: Sequence[str],
-    settings: Sequence[str],
-    out: Path,
-    workers: int,
-    device: str,
-    data: Path | None = None,
-) -> list[SequenceRun]:
+def make_sequences(name: str, request: Request) -> list[SequenceRun]:
     """Return the sequence for each method and seed.
 
     :raises ValueError: if a name or setting is invalid, or the method learns only single tasks
     """
     sequence = find_sequence(name)
-    for method in methods:
+    for method in request.methods:
         if find_method(method) and method not in able_methods():
             raise ValueError(
                 f"--method {method} learns single tasks; a sequence can be learned by "
                 f"{', '.join(able_methods())}"
             )
-    changes = [*sequence.changes(preset), {"packnet": {"tasks": len(sequence.tasks)}}]
-    runs = make_plan(
-        *(sequence.suite, sequence.tasks, preset, seeds, methods, settings, out, workers),
-        device=device,
-        data=data,
-        sections=changes,
-    )
+    changes = [*sequence.changes(request.preset), {"packnet": {"tasks": len(sequence.tasks)}}]
+    runs = make_plan(sequence.suite, sequence.tasks, request, changes)
     groups: dict[tuple[str, int], list[Run]] = {}
     for run in runs:
         groups.setdefault((run.method, run.seed), []).append(replace(run, sequence=name))

@@ -1,0 +1,91 @@
+"""The numbers of all runs below a folder, as the command `report` prints and writes them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from wpt_agents.zoo.report import steadiness, tables
+from wpt_agents.zoo.report.figure4 import (
+    Figure4,
+    figures_4,
+    find_sequences,
+    sequence_markdown,
+    sequence_table,
+)
+from wpt_agents.zoo.report.folders import (
+    Finished,
+    find_finished,
+    find_unfinished,
+    unfinished_text,
+)
+from wpt_agents.zoo.report.page import write_page
+from wpt_agents.zoo.terminal import console
+from wpt_agents.zoo.text_files import write_atomically
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The finished runs and sequences below a folder, and their tables.
+
+    :param rows: a row for each task and method
+    :param policies: a row for each task and policy
+    :param steady: how much the policies change from evaluation to evaluation
+    :param missing: a paragraph that names unfinished and failed runs, "" without any
+    """
+
+    folder: Path
+    runs: Sequence[Finished]
+    sequences: Sequence[Figure4]
+    rows: Sequence[tables.Row]
+    policies: Sequence[tables.PolicyRow]
+    steady: Sequence[steadiness.Steadiness]
+    missing: str
+
+    @classmethod
+    def of(cls, folder: Path) -> Self:
+        """Read all runs below a folder.
+
+        :raises ValueError: if a run exists twice
+        """
+        runs = find_finished(folder)
+        results = [run.result for run in runs]
+        return cls(
+            folder,
+            runs,
+            figures_4(find_sequences(folder)),
+            tables.summarise(results),
+            tables.policies(results),
+            steadiness.steadiness(runs),
+            unfinished_text(find_unfinished(folder)),
+        )
+
+    def markdown(self) -> str:
+        """Return all tables as Markdown."""
+        tasks = tables.markdown(self.rows) if self.rows else ""
+        policies = tables.policy_markdown(self.policies) if self.rows else ""
+        steady = steadiness.markdown(self.steady)
+        parts = (tasks, policies, steady, sequence_markdown(self.sequences), self.missing)
+        return "\n".join(filter(None, parts))
+
+    def csv(self) -> str:
+        """Return a line of CSV for every policy."""
+        return tables.policy_csv(self.policies)
+
+    def write(self, page: Path, media: str) -> None:
+        """Write the page, and Markdown and CSV files beside it.
+
+        :param media: as `write_page` takes it
+        """
+        write_page(self.folder, page, media, self.runs)
+        write_atomically(page.with_name("report.md"), self.markdown())
+        write_atomically(page.with_name("policies.csv"), self.csv())
+
+    def show(self) -> None:
+        """Print the means of every task and method, the sequences, and what is missing."""
+        if self.rows:
+            console.print(tables.summary_table(self.rows))
+        if self.sequences:
+            console.print(sequence_table(self.sequences))
+        if self.missing:
+            console.print(self.missing, markup=False)

@@ -50,6 +50,9 @@ class JSRLKeywords(DrQv2Keywords):
     bc_learning_rate: float = amount(
         1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
     )
+    bc_shift: int = count(
+        3, "largest random shift of the clone's images in training", Stage.CLONING, least=0
+    )
     bc_variance: str = choice(
         "fixed",
         BC_VARIANCES,
@@ -103,6 +106,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
             settings.value("bc_steps"),
             settings.value("bc_batch_size"),
             settings.bc_learning_rate,
+            settings.bc_shift,
             settings.bc_variance,
         )
         trained = clone(

@@ -228,6 +228,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 settings.value("bc_steps"),
                 settings.value("bc_batch_size"),
                 settings.bc_learning_rate,
+                settings.bc_shift,
                 settings.bc_variance,
                 settings.grad_clip,
             ),

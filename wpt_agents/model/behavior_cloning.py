@@ -89,10 +89,11 @@ def draw_pairs(
     return torch.from_numpy(image), torch.from_numpy(action), torch.from_numpy(chosen)
 
 
-def random_shift(image: Tensor, pad: int = 3, generator: Generator | None = None) -> Tensor:
+def random_shift(image: Tensor, pad: int, generator: Generator | None = None) -> Tensor:
     """Shift each stack of frames by up to `pad` pixels, repeating the border.
 
-    The paper does not say how far; 3 pixels are the authors'. DrQ-v2 has 4 of 84.
+    The paper does not say how far; 3 pixels are the authors', DrQ-v2 has 4 of 84. Smaller shifts
+    preserve more of where things are (docs/experiments.md).
 
     :param image: (N, F, H, W, C)
     """

@@ -29,6 +29,7 @@ class Cloning:
     :param steps: updates
     :param batch_size: images and actions in an update
     :param learning_rate: at the first update; it falls linearly to 0
+    :param shift: largest shift of the images, in pixels
     :param variance: "fixed", or "trajectory", an estimate for each trajectory
     :param grad_clip: largest norm of the gradient
     """
@@ -36,6 +37,7 @@ class Cloning:
     steps: int
     batch_size: int
     learning_rate: float
+    shift: int
     variance: str
     grad_clip: float = 100.0
 
@@ -68,7 +70,8 @@ def clone(
         pairs = draw_pairs(trajectories, settings.batch_size, len(action_mask), rng)
         image, action, chosen = (tensor.to(device) for tensor in pairs)
         with autocast():
-            image = random_shift(image, generator=streams.torch(Purpose.CLONE, step, device))
+            generator = streams.torch(Purpose.CLONE, step, device)
+            image = random_shift(image, settings.shift, generator)
             prediction, weight = actor(image), None
             if variances is not None:
                 variances.update(prediction, action, action_mask, chosen)

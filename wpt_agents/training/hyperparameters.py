@@ -341,6 +341,13 @@ class Hyperparameters(Keywords):
         "learning rate of the prior actor at its first update; it falls linearly to 0",
         Stage.CLONING,
     )
+    bc_shift: int = count(
+        3,
+        "the prior actor's images are shifted by up to this number of pixels at random. The paper "
+        "does not say how far; 3 pixels are the authors'",
+        Stage.CLONING,
+        least=0,
+    )
     bc_variance: str = choice(
         "fixed",
         BC_VARIANCES,

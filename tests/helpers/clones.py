@@ -1,4 +1,4 @@
-"""Measure what two ways of behaviour cloning change, on tasks of Meta-World.
+"""Compare ways of behaviour cloning, on tasks of Meta-World.
 
     for task in drawer-open button-press-topdown-wall door-unlock window-open; do
         python -m wpt_agents.zoo collect --suite metaworld --tasks $task --episodes 20 \
@@ -6,15 +6,15 @@
     done
     python tests/helpers/clones.py --seeds 3
 
-For each task and seed, two prior actors with the same initial weights are cloned from the 20
-episodes, in 2,000 updates of 64 images and actions: with a learning rate of 1e-3 at every update,
-and with one that falls linearly from 1e-3 to 0, as the library's does. Each plays the same 20 new
-episodes. The columns are success rate and mean return of both, and the CPU seconds of cloning.
+For each task and seed, prior actors with the same initial weights are cloned from the same
+episodes, in updates of 64 images and actions, and play the same new episodes. The columns are the
+success rate and mean return of each variant, and the CPU seconds of cloning. A variant is keywords
+of `WPT`, or `constant`: a learning rate of 1e-3 at every update instead of one that falls linearly
+from 1e-3 to 0, as the library's does. Without further options, `constant` is compared with the
+library's defaults. The sizes of the preset `mid` are, on data of 60 episodes:
 
-With `--compare bc_variance`, the rate falls for both, and the first has `bc_variance="fixed"`, the
-second "trajectory". Some settings of the preset `mid` are then
-
-    python tests/helpers/clones.py --compare bc_variance --size mid --retrieve 40 --steps 4000
+    python tests/helpers/clones.py --tasks push-wall --size mid --retrieve 40 --steps 4000 \
+        --variants "" bc_shift=1 bc_variance=trajectory "bc_shift=1 bc_variance=trajectory"
 """
 
 import argparse
@@ -27,6 +27,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import torch
 import wpt_envs  # noqa: F401  # registers the ids
+import yaml
 from torch.optim.lr_scheduler import ConstantLR
 
 from wpt_agents import WPT
@@ -42,10 +43,10 @@ def constant(optimizer: torch.optim.Optimizer, *_: float) -> ConstantLR:
     return ConstantLR(optimizer, factor=1.0)
 
 
-def measured(settings: argparse.Namespace, task: str, seed: int, second: bool) -> str:
+def measured(settings: argparse.Namespace, task: str, seed: int, variant: str) -> str:
     """Clone a prior actor and evaluate it; return its success rate, return and CPU seconds."""
     name = f"wpt/metaworld-{task}-v0"
-    of_variance = settings.compare == "bc_variance"
+    words = [word for word in variant.split() if word != "constant"]
     model = WPT(
         "WPTPolicy",
         gym.make(name, **FAST),
@@ -56,12 +57,12 @@ def measured(settings: argparse.Namespace, task: str, seed: int, second: bool) -
         bc_steps=settings.steps,
         bc_batch_size=64,
         bc_learning_rate=1e-3,
-        bc_variance="trajectory" if of_variance and second else "fixed",
         seed=seed,
         device="cpu",
+        **{key: yaml.safe_load(value) for key, value in (word.split("=") for word in words)},
     )
     start = time.process_time()
-    with nullcontext() if of_variance or second else patch(RATES, constant):
+    with patch(RATES, constant) if "constant" in variant else nullcontext():
         model.learn(1)  # retrieves, clones, and makes a step of the task
     seconds = time.process_time() - start
     score = evaluate(model.prior, name, FAST, settings.episodes, seed=1000 + seed)
@@ -70,17 +71,17 @@ def measured(settings: argparse.Namespace, task: str, seed: int, second: bool) -
 
 
 def main(settings: argparse.Namespace) -> None:
-    """Print a row for each task and seed as soon as both prior actors are measured."""
+    """Print a row for each task and seed as soon as all prior actors are measured."""
     for task in settings.tasks:
         for seed in range(settings.first, settings.first + settings.seeds):
-            row = [measured(settings, task, seed, second) for second in (False, True)]
+            row = [measured(settings, task, seed, variant) for variant in settings.variants]
             print("|", " | ".join([task, str(seed), *row]), "|", flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("data"), help="a folder for each task")
-    parser.add_argument("--compare", choices=["rate", "bc_variance"], default="rate")
+    parser.add_argument("--variants", nargs="+", default=["constant", ""], help="the columns")
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--size", default="tiny")
     parser.add_argument("--retrieve", type=int, default=20, help="trajectories to clone from")

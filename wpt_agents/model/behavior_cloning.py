@@ -37,9 +37,10 @@ def bc_loss(
 class TrajectoryVariances:
     """σ_i²: how far the actions of each trajectory are from the prior actor's, on average.
 
-    They maximise the likelihood of all actions, if those of trajectory i are Gaussian around the
-    prior actor's with a variance of its own. The squared errors of a trajectory then count in
-    proportion to 1 / σ_i², so that a noisy demonstrator has less influence. Not in the paper.
+    Running estimates of the maximum of the likelihood, if the actions of trajectory i are Gaussian
+    around the prior actor's with a variance of their own. The squared errors of a trajectory then
+    count in proportion to 1 / σ_i², so that a noisy demonstrator has less influence. Not in the
+    paper.
     Source of the idea, for discrete actions: https://arxiv.org/abs/2202.01288
 
     :param n: number of trajectories

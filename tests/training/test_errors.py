@@ -62,8 +62,8 @@ def test_an_environment_that_does_not_fit_is_refused(env, words):
         agent(env)
 
 
-def test_a_pretrained_model_is_to_be_pretrained_again_for_more_actions(tmp_path):
-    words = "max_action_dim=4: pre-train with a larger max_action_dim"
+def test_more_actions_than_a_trained_model_takes_need_a_new_model(tmp_path):
+    words = "max_action_dim=4: train a new one with max_action_dim=5"
     model = pretrained([recorded()])
     with pytest.raises(ValueError, match=words):
         model.set_env(ClockEnv(actions=5))

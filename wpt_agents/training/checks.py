@@ -63,7 +63,8 @@ def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) 
     if trajectory.action_dim > max_action_dim:
         raise ValueError(
             f"The trajectory has {trajectory.action_dim} actions, the model takes at most "
-            f"max_action_dim={max_action_dim}: pre-train with a larger max_action_dim"
+            f"max_action_dim={max_action_dim}: train a new one with "
+            f"max_action_dim={trajectory.action_dim}"
         )
 
 

@@ -183,10 +183,10 @@ def check_actions(
         )
     width = space.shape[0]
     if max_action_dim is not None and width > max_action_dim:
-        larger = "pre-train with a larger max_action_dim"
+        remedy = "train a new one" if trained else "make it"
         raise ValueError(
             f"The environment has {width} actions, the model was made for at most max_action_dim="
-            f"{max_action_dim}: {larger if trained else f'make it with max_action_dim={width}'}"
+            f"{max_action_dim}: {remedy} with max_action_dim={width}"
         )
 
 

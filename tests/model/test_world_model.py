@@ -239,7 +239,8 @@ def test_the_paper_sizes_heads():
 
 
 @pytest.mark.parametrize(
-    ("size", "million"), [("debug", 0.1), ("tiny", 0.5), ("small", 2), ("medium", 14)]
+    ("size", "million"),
+    [("debug", 0.1), ("tiny", 0.5), ("mid", 2.1), ("small", 2), ("medium", 14)],
 )
 def test_the_smaller_sizes_count_about_what_they_say(size, million):
     with torch.device("meta"):

@@ -24,10 +24,11 @@ FILE = "result.json"
 NOTHING = "nothing"  # the zero action
 RANDOM = "random"  # uniform actions
 PRIOR_ACTOR = "prior actor"  # the policy that imitates the retrieved trajectories
-HEAD_START = "after head start"  # the actor when the head start of fine-tuning ended
+HEAD_START = "after head start"  # the agent when the head start of fine-tuning ended
+IMITATION = "imitating actor"  # its actor alone, if the prior actor takes part in acting, too
 LAST = "last"  # the agent at the end of fine-tuning
 BEST = "best"  # the best agent of the evaluations during fine-tuning
-POLICIES = (NOTHING, RANDOM, PRIOR_ACTOR, HEAD_START, LAST, BEST)
+POLICIES = (NOTHING, RANDOM, PRIOR_ACTOR, HEAD_START, IMITATION, LAST, BEST)
 UNTRAINED = (NOTHING, RANDOM)
 
 Metric = Literal["return", "success"]

@@ -41,8 +41,14 @@ def test_the_model_bench_prints_a_json_object_for_each_case():
     alone, whole = rows
     assert whole["gflop"] > alone["gflop"] and whole["params"] > alone["params"]
     assert (alone["imagined"], whole["imagined"]) == (0, 2 * 8 * 16)  # from every state, 16 steps
-    few = WPT(size="debug", imagine_starts=4, imagine_horizon=3)
-    assert bench_model.imagined_states(few, bench_model.synthetic_batch(2, 8)) == 4 * 3
+    settings = ["imagine_starts=4", "imagine_horizon=3"]
+    *_, few = bench_model.rows(quick=True, settings=settings)
+    assert few["imagined"] == 4 * 3 and few["gflop"] < whole["gflop"]
+    marked = bench_model.with_marks(bench_model.synthetic_batch(2, 8))
+    assert marked.moving.shape == (2, 8, 64, 64) and 0.09 < marked.moving.float().mean() < 0.11
+    assert next(bench_model.rows(quick=True, settings=["pixel_weight=8"]))["median_s"] > 0
+    with pytest.raises(ValueError, match="batch_size"):  # which the case sets
+        next(bench_model.rows(quick=True, settings=["batch_size=4"]))
 
 
 def test_the_gpu_bench_measures_both_steps_and_needs_a_gpu():
@@ -115,8 +121,9 @@ def test_the_other_cases_yield_rows():
     acting = list(policy.rows(quick=True))
     assert [row["what"] for row in acting] == ["policy step", "policy step, by definition"]
     assert all(row["batch"] == 1 and row["median_s"] > 0 for row in acting)
-    (sampling,) = replay.rows(quick=True)
+    sampling, marked = replay.rows(quick=True)
     assert sampling["image_mb"] == pytest.approx(3 * 501 * 64 * 64 * 3 / 2**20)
+    assert "background_s" not in sampling and marked["background_s"] > 0 and marked["median_s"] > 0
     every, *top = profile.rows(quick=True)
     assert every["count"] > sum(row["count"] for row in top) > 0
     shares = [row["share"] for row in top]
@@ -209,7 +216,7 @@ def test_a_wrong_import_of_ours_is_not_called_a_missing_package(fault, words, mo
         ("prediction", ["--steps", "9"]),
         ("work", ["--threads", "2"]),
         ("policy", ["--precision", "bf16"]),
-        ("model", ["--set", "gamma=0.9"]),
+        ("profile", ["--set", "gamma=0.9"]),
     ],
 )
 def test_an_option_without_effect_on_the_case_is_refused(case, option):

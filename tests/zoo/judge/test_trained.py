@@ -49,6 +49,23 @@ def test_a_moved_run_without_its_data_plays_as_it_did(moved):
         assert score.returns == pytest.approx(result.scores[name].returns)
 
 
+def test_the_actor_of_the_head_start_is_scored_alone_where_the_prior_actor_acts_with_it(tmp_path):
+    keywords = {**SECTIONS["wpt"], "residual": True, "actor_delay": 2, "guidance": 0}
+    one = job(tmp_path, wpt=keywords)
+    scores = run(one).scores
+    assert list(scores)[2:] == ["prior actor", "after head start", "imitating actor", "last"]
+    # before any imagination there is nothing to correct: the prior actor acts
+    returns = {name: score.returns for name, score in scores.items()}
+    assert returns["after head start"] == pytest.approx(returns["prior actor"])
+    assert returns["imitating actor"] != pytest.approx(returns["prior actor"])
+    trained = find_trained(one.folder / "head_start_model.zip")
+    score = trained.evaluate(trained.load("actor"), 3, one.evaluation_seed)
+    assert score.returns == pytest.approx(returns["imitating actor"])
+    other = replace(trained, method=METHODS["drq-v2"])
+    with pytest.raises(ValueError, match="is not WPT's: its actor always acts alone"):
+        other.choose(METHODS["drq-v2"].agent(), "actor")
+
+
 def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     folder, _, seed = moved
     assert call(monkeypatch, "eval", folder, "--episodes", "2", "--seed", seed) == 0

@@ -372,6 +372,21 @@ def test_a_method_named_twice_is_one_and_the_last_of_two_settings_counts(tmp_pat
     assert (one.keywords["gamma"], str(one.variant)) == (0.9, "debug gamma=0.9")
 
 
+@pytest.mark.parametrize(("suite", "task"), [("metaworld", "drawer-open"), ("dmc", "walker-walk")])
+def test_scratch_has_all_of_wpt_plus_but_data_and_prior_actor(suite, task, tmp_path):
+    wpt, plus, scratch = (
+        plan(suite, [task], "mid", tmp_path, method)[0] for method in ("wpt", "wpt+", "scratch")
+    )
+    none = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
+    assert scratch.keywords == plus.keywords | none | {"offline_ratio": 0.0}
+    # 1,000 steps earn 1000 * 64 / (16 * 16) = 250 of the head start's 300 updates; 1,500 steps of
+    # DMControl earn 1500 * 64 / (16 * 32) = 187.5
+    updates = {"metaworld": (1500, 1550), "dmc": (2500, 2612)}
+    assert (wpt.updates, plus.updates) == updates[suite] and scratch.updates == plus.updates
+    assert wpt.keywords == wpt.preset.wpt and plus.keywords == wpt.preset.wpt | wpt.preset.plus
+    assert scratch.keywords["actor_delay"] == 300 and scratch.keywords["actor_critic_decay"]
+
+
 @pytest.mark.parametrize("method", ["wpt", "wpt+"])
 @pytest.mark.parametrize("key", ["kickstart", "wpt.kickstart"])
 def test_a_setting_overrules_the_additions_of_the_preset(key, method, tmp_path):

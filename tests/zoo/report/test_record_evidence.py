@@ -224,6 +224,7 @@ def test_negative_scores_of_hard_tasks_are_within_the_picture():
 
 def test_policies_in_between_are_not_drawn_in_rows_at_any_budget():
     names = ["wpt, last", "wpt, last, 3x frames", "wpt+, after head start, 3x frames", "nothing"]
+    names += ["wpt+, imitating actor"]
     assert not any(map(record_picture.drawn, names))
     assert all(map(record_picture.drawn, ["wpt", "prior actor, no-pretrain", "scratch, 3x frames"]))
 

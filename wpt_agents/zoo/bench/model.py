@@ -1,13 +1,14 @@
 """Gradient steps: of the world model alone, and of all networks."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import nn
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.data.trajectory import Batch
+from wpt_agents.data.trajectory import Batch, MarkedBatch
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.zoo.bench.timing import (
     cost,
@@ -20,6 +21,8 @@ from wpt_agents.zoo.bench.timing import (
     seconds_in_turn,
 )
 from wpt_agents.zoo.machine import one_thread
+from wpt_agents.zoo.plan.methods import defaults
+from wpt_agents.zoo.plan.presets import keywords
 
 ACTIONS = 6
 CASES = (  # size, batch, length; `bench scaling` shows what grows with each
@@ -27,23 +30,44 @@ CASES = (  # size, batch, length; `bench scaling` shows what grows with each
     *((size, 16, 64) for size in ("tiny", "small")),
 )
 
+# Keywords of WPT that the cases or other options set.
+FIXED = {"size", "max_action_dim", "precision", "compile", "batch_size", "batch_length"}
+
 
 def rows(
-    quick: bool = False, threads: int = 1, precision: str = "fp32", compiled: bool = False
+    quick: bool = False,
+    threads: int = 1,
+    precision: str = "fp32",
+    compiled: bool = False,
+    settings: Sequence[str] = (),
 ) -> Iterator[dict]:
-    """Yield a row for each case; `quick` uses the debug size and one repetition."""
+    """Yield a row for each case; `quick` uses the debug size and one repetition.
+
+    :param settings: keywords of WPT as "key=value", except those that a case or another option sets
+    """
     torch.set_num_threads(threads)
+    changes = keywords(settings, defaults(WPT).keys() - FIXED)
     for case in (("debug", 2, 8),) if quick else CASES:
-        yield from updates(*case, precision, 1 if quick else 5, compiled)
+        yield from updates(*case, precision, 1 if quick else 5, compiled, changes)
 
 
 def updates(
-    size: str, batch: int, length: int, precision: str, repetitions: int, compiled: bool = False
+    size: str,
+    batch: int,
+    length: int,
+    precision: str,
+    repetitions: int,
+    compiled: bool = False,
+    changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row for the world model's step, and one for the whole update."""
-    model = agent(size, precision, compiled)
-    plain = agent(size, precision) if compiled else model
-    data = synthetic_batch(batch, length).to(model.device)
+    """Yield a row for the world model's step, and one for the whole update.
+
+    :param changes: further keywords of WPT
+    """
+    model = agent(size, precision, compiled, **changes)
+    plain = agent(size, precision, **changes) if compiled else model
+    data = synthetic_batch(batch, length)
+    data = (with_marks(data) if model.hyperparameters.marks else data).to(model.device)
     columns = {"size": size, "batch": batch, "length": length, "dtype": precision}
     columns |= {"compiled": True} if compiled else {}
     networks = model.policy.world_model, model.policy.actor, model.policy.critic
@@ -114,9 +138,10 @@ def _peak_mb(step: Callable[[], Any]) -> float:
     return peak_rss_mb()
 
 
-def agent(size: str, precision: str = "fp32", compiled: bool = False) -> WPT:
+def agent(size: str, precision: str = "fp32", compiled: bool = False, **changes: Any) -> WPT:
     """Return an untrained agent with six actions."""
-    return WPT(size=size, max_action_dim=ACTIONS, precision=precision, compile=compiled, seed=0)
+    changes |= {"precision": precision, "compile": compiled}
+    return WPT(size=size, max_action_dim=ACTIONS, seed=0, **changes)
 
 
 def synthetic_batch(batch: int, length: int) -> Batch:
@@ -134,6 +159,13 @@ def synthetic_batch(batch: int, length: int) -> Batch:
         is_terminal=torch.zeros(shape, dtype=torch.bool),
         reward_known=~is_first,
     )
+
+
+def with_marks(batch: Batch) -> MarkedBatch:
+    """Return the batch with a tenth of its pixels marked as moving, for `pixel_weight`."""
+    generator = torch.Generator().manual_seed(0)
+    moving = torch.rand(batch.image.shape[:-1], generator=generator) < 0.1
+    return MarkedBatch(**vars(batch), moving=moving)
 
 
 def world_model_step(model: WPT, batch: Batch, learn_reward: bool = False) -> Callable[[], Any]:

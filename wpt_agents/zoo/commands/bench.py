@@ -75,7 +75,7 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="For prediction: a keyword of WPT for the world models, such as `size=mid`; can be "
+        help="For prediction and model: a keyword of WPT, such as `imagine_starts=128`; can be "
         "repeated.",
     ),
 ]

@@ -33,7 +33,10 @@ ForTask = Annotated[
 
 Policy = Annotated[
     str,
-    typer.Option(help="The policy to play: wpt for the trained agent, prior for its prior actor."),
+    typer.Option(
+        help="The policy to play: wpt for the trained agent, prior for its prior actor, and actor "
+        "for its actor alone if the prior actor takes part in acting (`residual`, `ibrl`)."
+    ),
 ]
 
 ModelArgument = Annotated[

@@ -24,7 +24,7 @@ from wpt_agents.zoo.plan.presets import EnvSettings
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.tasks import find_tasks
 
-POLICIES = ("wpt", "prior")  # "wpt" is the agent of any method
+POLICIES = ("wpt", "prior", "actor")  # "wpt" is the agent of any method
 FILMS = (".mp4", ".gif")
 MOST_NAMED = 5  # run folders that an error message names
 
@@ -43,9 +43,9 @@ class Trained:
     method: Method = METHODS["wpt"]
 
     def load(self, policy: str = "wpt", device: str = "auto") -> PolicyPredictor:
-        """Load the agent ("wpt"), or the prior actor that guided it ("prior"), without a dataset.
+        """Load a policy, without a dataset: the agent ("wpt"), or one that `choose` takes from it.
 
-        :raises ValueError: if the policy is unknown or the model has no prior actor
+        :raises ValueError: if the policy is unknown or the model has none of this name
         """
         return self.choose(self.load_agent(device), policy)
 
@@ -55,11 +55,18 @@ class Trained:
         return self.method.agent.load(self.model, device=device)
 
     def choose(self, agent: BaseAlgorithm, policy: str) -> PolicyPredictor:
-        """Return the agent ("wpt") or its prior actor ("prior")."""
+        """Return the agent ("wpt"), its prior actor ("prior"), or its actor alone ("actor").
+
+        The agent acts as before only if "actor" is not chosen.
+        """
         if policy not in POLICIES:
             raise unknown_name("policy", policy, POLICIES)
         if policy == "wpt":
             return agent
+        if policy == "actor":
+            if not isinstance(agent, WPT):
+                raise ValueError(f"{self.model} is not WPT's: its actor always acts alone, as wpt")
+            return actor_alone(agent)
         prior: PolicyPredictor | None = getattr(agent, "prior", None)
         if prior is None:
             raise ValueError(f"{self.model} has no prior actor: it was trained without guidance")
@@ -94,6 +101,17 @@ class Trained:
             animate(path, shots, fps)
         assert trajectory.reward is not None
         return float(trajectory.reward.sum())
+
+
+def actor_alone(agent: Any) -> PolicyPredictor:
+    """Let an agent act by its actor alone, without the prior actor (`residual`, `ibrl`).
+
+    :param agent: a `WPT`
+    """
+    agent.residual = False
+    agent.ibrl = False
+    policy: PolicyPredictor = agent
+    return policy
 
 
 def find_trained(path: Path, task: str = "") -> Trained:

@@ -140,8 +140,10 @@ class Run:
             return None
         if self.preset.steps < agent.learning_starts:
             return 0
-        earned = self.preset.steps * agent.train_ratio / (agent.batch_size * agent.batch_length)
-        return int(max(earned, agent.actor_delay))
+        per_step = agent.train_ratio / (agent.batch_size * agent.batch_length)
+        # What the steps before `learning_starts` have earned counts towards the head start.
+        more = max(agent.actor_delay - agent.learning_starts * per_step, 0)
+        return int(self.preset.steps * per_step + more)
 
     @property
     def evaluation_seed(self) -> int:

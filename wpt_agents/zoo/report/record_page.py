@@ -18,7 +18,8 @@ This page shows the scores in the CSV file of the same name, a record of runs th
 of its method. `nothing` does nothing, `random` acts uniformly at random, and `prior actor` is the
 behaviour clone with which WPT begins; `prior actor, METHOD` is the clone of another method. If runs
 kept the policy that did best in evaluations, this is `METHOD`, and `METHOD, last` is the last one.
-`METHOD, after head start` is the policy after the first `actor_delay` updates.
+`METHOD, after head start` is the policy after the first `actor_delay` updates, and `METHOD,
+imitating actor` its actor alone, if the prior actor takes part in acting (`residual`, `ibrl`).
 """
 
 

@@ -21,6 +21,7 @@ from wpt_agents.zoo.report.aggregates import PAPER_BUDGET
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
 from wpt_agents.zoo.report.headline import SUITES
 from wpt_agents.zoo.report.record_tables import Cell, Key, by_task
+from wpt_agents.zoo.result import HEAD_START, IMITATION, LAST, NOTHING
 
 PANELS = 8  # up to this number of tasks each has a panel
 
@@ -115,7 +116,8 @@ def styles_of(names: Collection[str]) -> dict[str, Style]:
 
 def drawn(method: str) -> bool:
     """Return whether a method is shown in rows of tasks; the tables show all methods."""
-    return method != "nothing" and not {"last", "after head start"} & set(method.split(", "))
+    between = {HEAD_START, IMITATION, LAST}
+    return method != NOTHING and not between & set(method.split(", "))
 
 
 def _draw_suite(panel: Axes, one: Evidence, styles: dict[str, Style]) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -10,11 +11,12 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.judge.evaluation import evaluate, film
+from wpt_agents.zoo.judge.trained import actor_alone
 from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
 from wpt_agents.zoo.pictures import runs as pictures
 from wpt_agents.zoo.plan.runs import Run
-from wpt_agents.zoo.result import BEST, HEAD_START, LAST, PRIOR_ACTOR, Score
+from wpt_agents.zoo.result import BEST, HEAD_START, IMITATION, LAST, PRIOR_ACTOR, Score
 from wpt_agents.zoo.run.checkpoints import BEST_MODEL, HEAD_START_MODEL, checksum
 from wpt_agents.zoo.run.shared import play_untrained
 from wpt_agents.zoo.tasks import short_name
@@ -49,7 +51,10 @@ def policies(run: Run, agent: BaseAlgorithm) -> dict[str, PolicyPredictor]:
     if prior is not None:
         trained[PRIOR_ACTOR] = prior
     if (head_start := run.folder / HEAD_START_MODEL).exists():
-        trained[HEAD_START] = load(head_start)
+        agent_then: Any = load(head_start)
+        trained[HEAD_START] = agent_then
+        if agent_then.policy.sees_frames:  # of which the prior actor is a part
+            trained[IMITATION] = actor_alone(load(head_start))
     trained[LAST] = agent
     if (best := run.folder / BEST_MODEL).exists():
         trained[BEST] = load(best)

@@ -12,6 +12,7 @@ import wpt_envs
 from dm_control.rl.control import PhysicsError
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from sampling import one_in_eight
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -298,7 +299,7 @@ WRAPPED = "ignore:.*is different from the unwrapped version"  # the pixels are w
 
 
 @pytest.mark.filterwarnings(WRAPPED)
-@pytest.mark.parametrize("name", wpt_envs.TASKS)
+@pytest.mark.parametrize("name", one_in_eight(wpt_envs.TASKS))
 def test_the_checkers_of_gymnasium_and_sb3_pass(name):
     env = gym.make(name, rendering="fast", image_size=40, pad_action_to="suite", action_repeat=2)
     check_env(env, skip_render_check=True)

@@ -22,6 +22,7 @@ from zoo_command import call
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import Diagnosis, Promise, promises, show
+from wpt_agents.zoo.judge.evaluation import NoisyPolicy
 from wpt_agents.zoo.judge.trained import Origin, find_trained
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.hub import card, pull, push
@@ -86,6 +87,30 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
         "wpt_agents.zoo.judge.trained.read_origin", lambda _: Origin("", SECTIONS["env"])
     )
     assert call(monkeypatch, "eval", model, *words) == 0
+
+
+def test_noise_on_the_actions_is_of_the_asked_size_and_seeded():
+    class Still:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return np.full((len(observation), 4), 0.9, np.float32), state
+
+    obs = np.zeros((5000, 1))
+    noisy, _ = NoisyPolicy(Still(), 0.02, seed=1).predict(obs)
+    assert noisy.dtype == np.float32
+    assert noisy.mean() == pytest.approx(0.9, abs=1e-3)
+    assert noisy.std() == pytest.approx(0.02, rel=0.02)
+    again, other = (NoisyPolicy(Still(), 0.02, seed).predict(obs)[0] for seed in (1, 2))
+    assert np.array_equal(noisy, again) and not np.array_equal(noisy, other)
+    assert NoisyPolicy(Still(), 5.0, seed=1).predict(obs)[0].max() == 1  # clipped
+
+
+def test_eval_plays_with_noise_if_asked(moved):
+    folder, _, seed = moved
+    trained = find_trained(folder)
+    plain, noisy, again = (
+        trained.evaluate(trained.load(), 2, seed, noise).returns for noise in (0, 0.5, 0.5)
+    )
+    assert noisy == again and noisy != plain
 
 
 def test_diagnose_shows_promises_beside_what_came(moved, monkeypatch, capsys):

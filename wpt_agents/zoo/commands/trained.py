@@ -54,6 +54,14 @@ def evaluate_model(
     policy: Policy = "wpt",
     episodes: Annotated[int, typer.Option(min=1, help="The number of episodes.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="The seed of the first initial state.")] = 10_000,
+    noise: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            help="The standard deviation of Gaussian noise on the actions, which shows how precise "
+            "they have to be.",
+        ),
+    ] = 0.0,
     device: Device = "auto",
 ) -> None:
     """Play a trained model on its task and show its returns. No dataset is needed.
@@ -64,7 +72,7 @@ def evaluate_model(
     from wpt_agents.zoo.numbers import interval_text, number
 
     trained = find_trained(run, task)
-    score = trained.evaluate(trained.load(policy, device), episodes, seed)
+    score = trained.evaluate(trained.load(policy, device), episodes, seed, noise)
     mean, low, high = score.interval
     typer.echo(f"task             {trained.task}")
     typer.echo(f"mean return      {number(mean)}")

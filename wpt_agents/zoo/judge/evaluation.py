@@ -70,6 +70,31 @@ def evaluate(
     return Score(tuple(returns), tuple(successes), tuple(successes_any))
 
 
+class NoisyPolicy:
+    """A policy with Gaussian noise on its actions, to see how precise they have to be.
+
+    :param policy: its actions are in [-1, 1], as those of all tasks of the zoo
+    :param std: standard deviation of the noise; actions are clipped to [-1, 1] afterwards
+    :param seed: seed of the noise
+    """
+
+    def __init__(self, policy: PolicyPredictor, std: float, seed: int) -> None:
+        self.policy, self.std = policy, std
+        self.rng = np.random.default_rng(seed)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the policy's action with noise, and its next state."""
+        action, state = self.policy.predict(observation, state, episode_start, deterministic)
+        noise = self.std * self.rng.standard_normal(action.shape)
+        return np.clip(action + noise, -1, 1).astype(action.dtype), state
+
+
 def acting(policy: PolicyPredictor) -> Act:
     """Return a function for `record` that keeps the policy's recurrent state in an episode."""
     state: State | None = None

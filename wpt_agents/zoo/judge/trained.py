@@ -14,7 +14,7 @@ from wpt_envs.tasks import TASKS
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import agent_of
 from wpt_agents.files.names import unknown_name
-from wpt_agents.zoo.judge.evaluation import evaluate, film
+from wpt_agents.zoo.judge.evaluation import NoisyPolicy, evaluate, film
 from wpt_agents.zoo.judge.prediction import CONTEXT
 from wpt_agents.zoo.machine import check_device
 from wpt_agents.zoo.pictures import runs
@@ -72,8 +72,15 @@ class Trained:
             raise ValueError(f"{self.model} has no prior actor: it was trained without guidance")
         return prior
 
-    def evaluate(self, policy: PolicyPredictor, episodes: int, seed: int) -> Score:
-        """Return the score over seeded episodes."""
+    def evaluate(
+        self, policy: PolicyPredictor, episodes: int, seed: int, noise: float = 0.0
+    ) -> Score:
+        """Return the score over seeded episodes.
+
+        :param noise: standard deviation of Gaussian noise on the actions
+        """
+        if noise:
+            policy = NoisyPolicy(policy, noise, seed)
         return evaluate(policy, self.task, self.env, episodes, seed, wrap=self.method.wrap)
 
     def record(

@@ -1,7 +1,7 @@
 """The label of a record's line says what ran: its settings are those of the line's own commit.
 
-When a preset changes, earlier lines need the former settings in their labels. Defaults of the library
-are the present ones for both.
+When a preset changes, earlier lines need the former settings in their labels. The defaults of the
+library are the present ones for both.
 """
 
 import shlex

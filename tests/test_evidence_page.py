@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from wpt_agents.zoo.commands.app import app
+from wpt_agents.zoo.plan.presets import load_preset
 from wpt_agents.zoo.report.evidence import HIGH, LOW, paper_scores
 from wpt_agents.zoo.run import dispatch
 from wpt_agents.zoo.tasks import short_name
@@ -58,3 +59,20 @@ def test_part_a_is_every_task_of_the_paper_and_b_the_tasks_with_a_gap_and_two_co
         and papers["wpt"][task] >= HIGH
     }
     assert with_gap == chosen - WITHOUT_GAP
+
+
+@pytest.mark.parametrize(
+    ("column", "suite", "name"), [(0, "metaworld", "mid"), (1, "dmc", "mid"), (2, "dmc", "paper")]
+)
+def test_the_table_of_the_preset_has_the_numbers_of_its_file(column, suite, name):
+    (text,) = re.findall(r"\n## The preset\n.*?\n(\|.*?)\n\n", PAGE, re.S)
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in text.splitlines()[2:]]
+    cells = {row[0].split(" ")[0]: row[1 + column] for row in rows}
+    preset = load_preset(suite, name)
+    batch, length = preset.wpt["batch_size"], preset.wpt["batch_length"]
+    ratio, steps = preset.wpt["train_ratio"], preset.steps
+    assert cells["frames;"] == f"{preset.learn.frames:,}; {steps:,}"
+    assert cells["batch"] == f"{batch} x {length}; {preset.wpt.get('imagine_starts', 'all')}"
+    assert cells["train"] == f"{ratio}; {steps * ratio // (batch * length):,}"
+    share = {"a sixth (ten episodes)": 1 / 6, "a tenth": 0.1}[cells["warm-up,"]]
+    assert preset.wpt["warmup_steps"] == pytest.approx(share * steps)

@@ -94,6 +94,15 @@ def test_the_wheel_works_outside_the_checkout(installed, tmp_path):
 
 
 @pytest.mark.nightly
+def test_the_shipped_models_load_by_name_from_the_wheel(installed, tmp_path):
+    names = sorted(path.stem for path in (ROOT / "zoo" / "models").glob("*.zip"))
+    assert {"dmc-mid", "metaworld-mid"} <= set(names)
+    code = f"from wpt_agents import WPT; print([WPT.load(n).max_action_dim for n in {names}])"
+    ran = outside(installed, tmp_path, "-c", code)
+    assert ran.stdout.strip() == "[12, 4]", ran.stdout + ran.stderr
+
+
+@pytest.mark.nightly
 def test_the_readmes_example_runs_from_the_wheel(installed, tmp_path):
     readme = (ROOT / "README.md").read_text()
     code = re.search(r"## Example\n.*?```python\n(.*?)```", readme, re.S)[1]

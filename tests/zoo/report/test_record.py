@@ -177,6 +177,13 @@ def test_presets_are_kept_apart():
     assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record_tables.markdown(lines)
 
 
+def test_changed_settings_are_named_also_without_a_run_of_the_unchanged_preset():
+    lines = [line("wpt", 40.0, preset="tiny gamma=0.9"), line("random", 1.0, frames=0)]
+    lines += [line("wpt", 50.0, preset="tiny size=mid")]
+    names = {"random", "wpt, tiny gamma=0.9", "wpt, tiny size=mid"}
+    assert set(record_tables.by_suite(lines)) == names
+
+
 def test_another_csv_is_refused(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match=r"other.csv is not a record.*its columns are suite"):

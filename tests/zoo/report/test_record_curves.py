@@ -97,6 +97,20 @@ def test_a_panel_shows_the_mean_the_prior_actor_and_the_papers_score(tmp_path, m
     ]
 
 
+@pytest.mark.parametrize("tasks", [["hammer"], ["hammer", "drawer-open"]])
+def test_the_legend_of_few_panels_fits_into_the_picture(tasks, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(record_curves.plt, "close", drawn.append)
+    for task in tasks:
+        for method in ("wpt", "scratch"):
+            make_run(tmp_path, f"metaworld-{task}", method=method)
+    record_page.add(tmp_path / "mid.csv", find_finished(tmp_path))
+    figure = drawn[-1]
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+
+
 def test_negative_returns_of_hard_tasks_are_within_the_panel(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(record_curves.plt, "close", drawn.append)

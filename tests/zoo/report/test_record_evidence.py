@@ -222,6 +222,21 @@ def test_negative_scores_of_hard_tasks_are_within_the_picture():
     assert record_picture.draw_panels(LINES).axes[0].get_xlim()[0] == -4
 
 
+def test_a_method_with_only_changed_settings_is_in_the_panel_with_their_names(
+    monkeypatch, tmp_path
+):
+    lines = [line("drq-v2", "hammer", 5.0), line("wpt+", "hammer", 7.0, preset="mid x=1")]
+    lines += [line("drq-v2", "hammer", 6.0, preset="mid x=1")]  # it has the unchanged preset, too
+    lines += [line("wpt", "hammer", 8.0, preset=f"mid x={i}") for i in range(2)]  # two settings
+    lines += [line("wpt+", "push", 9.0, preset="mid x=1")]  # no task of the unchanged preset
+    figures = []
+    monkeypatch.setattr(record_picture, "save", lambda figure, _: figures.append(figure))
+    record_picture.draw(tmp_path / "a.png", lines)
+    (panel,) = figures[0].axes
+    labels = [tick.get_text() for tick in panel.get_yticklabels()]
+    assert labels == ["wpt+,\nx=1", "drq-v2", "the paper's WPT,\n150,000 frames"]
+
+
 def test_policies_in_between_are_not_drawn_in_rows_at_any_budget():
     names = ["wpt, last", "wpt, last, 3x frames", "wpt+, after head start, 3x frames", "nothing"]
     names += ["wpt+, imitating actor"]

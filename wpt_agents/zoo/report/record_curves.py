@@ -137,7 +137,7 @@ def draw(record: Path, points: Sequence[Point], lines: Sequence[Line]) -> None:
         _draw_panel(panel, one, task, curves, styles)
     for panel in axes.flat[len(panels) :]:
         panel.remove()
-    _legend(figure)
+    _legend(figure, columns)
     save(figure, place_of(record).with_suffix(".png"))
 
 
@@ -182,8 +182,13 @@ def _draw_panel(
     panel.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Figure) -> None:
+def _legend(figure: Figure, columns: int) -> None:
     labels = legend_of(figure)
-    figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=4, fontsize=8)
+    figure.legend(
+        *(labels.values(), labels.keys()),
+        loc="outside upper center",
+        ncols=min(4, columns),  # a picture of few panels is narrow
+        fontsize=8,
+    )
     figure.supxlabel("thousand frames", fontsize=8)
     figure.supylabel("score, 0 to 100", fontsize=8)

@@ -1,7 +1,8 @@
 """A record as a picture: a panel per task, or a row per task if there are many.
 
 Both exclude runs with changed settings if there are others, and show the paper's WPT as a hollow
-marker. The colours are Okabe and Ito's colour-blind safe ones.
+marker. A panel also has the methods whose only runs on its task have changed settings, with these
+in their names. The colours are Okabe and Ito's colour-blind safe ones.
 """
 
 from collections import defaultdict
@@ -20,6 +21,7 @@ from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
 from wpt_agents.zoo.report.headline import SUITES
+from wpt_agents.zoo.report.record import order
 from wpt_agents.zoo.report.record_tables import Cell, Key, by_task
 from wpt_agents.zoo.result import HEAD_START, IMITATION, LAST, NOTHING
 
@@ -65,9 +67,31 @@ def least(scores: Iterable[float], usual: float) -> float:
 def draw(path: Path, lines: Sequence[Line]) -> None:
     """Draw the record with as much detail as its number of tasks allows."""
     usual = usual_lines(lines)
-    many = len({line.task for line in usual}) > PANELS
-    figure = draw_rows(evidence(usual)) if many else draw_panels(usual or lines)
+    if len({line.task for line in usual}) > PANELS:
+        figure = draw_rows(evidence(usual))
+    else:
+        figure = draw_panels(with_only_changed(usual, lines) if usual else lines)
     save(figure, path)
+
+
+def with_only_changed(usual: Sequence[Line], lines: Iterable[Line]) -> list[Line]:
+    """Add the lines with changed settings of methods that have no line in `usual` on a task.
+
+    A method with several such settings on a task is left out; the tables compare them.
+    """
+    tasks = {line.task for line in usual}
+    shown = {(line.task, line.method) for line in usual}
+    changed: dict[tuple[str, str], list[Line]] = defaultdict(list)
+    for line in lines:
+        if line.task in tasks and (line.task, line.method) not in shown:
+            changed[line.task, line.method].append(line)
+    alike = [
+        line
+        for same in changed.values()
+        if len({(line.preset, line.frames) for line in same}) == 1
+        for line in same
+    ]
+    return sorted([*usual, *alike], key=order)
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -213,17 +237,19 @@ def _draw_panel(panel: Axes, title: str, rows: Sequence[PanelRow]) -> None:
 
 
 def row_names(keys: Iterable[Key]) -> list[str]:
-    """Return the methods, with preset or budget if there are several."""
+    """Return the methods, with preset or budget if there are several.
+
+    The words of a preset that all trained policies share are left out.
+    """
     keys = list(keys)
-    presets: dict[str, set[frozenset[str]]] = defaultdict(set)
+    trained = [frozenset(preset.words) for _, preset, frames in keys if frames]
+    common = frozenset.intersection(*trained) if trained else frozenset()
     budgets: dict[str, set[int]] = defaultdict(set)
-    for method, preset, frames in keys:
-        presets[method].add(frozenset(preset.words))
+    for method, _, frames in keys:
         budgets[method].add(frames)
     names = []
     for method, preset, frames in keys:
-        common = frozenset.intersection(*presets[method])
-        changes = [word for word in preset.words if word not in common]
+        changes = [word for word in preset.words if word not in common] if frames else []
         budget = [f"{frames:,} frames"] if len(budgets[method]) > 1 else []
         names.append(", ".join([",\n".join([method, *changes]), *budget]))
     return names

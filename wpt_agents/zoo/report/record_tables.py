@@ -87,13 +87,14 @@ def column(line: Line, frames: int, preset: Variant) -> str:
     """Return the method with unusual settings of its run: "scratch, 3x frames".
 
     A budget that this would round has its own number of frames, so that two do not share a column.
+    Changed settings are always named, also if the record has no run of the unchanged preset.
     """
     ratio = f"{line.frames / frames:.3g}"
     exact = round(float(ratio) * frames) == line.frames
     budget = f"{ratio}x frames" if exact else f"{line.frames:,} frames"
     name = line.method if line.frames in (0, frames) else f"{line.method}, {budget}"
-    same = line.preset == (preset if line.frames else preset.playing)
-    return name if same else f"{name}, {line.preset}"
+    usual = line.preset == (preset if line.frames else preset.playing) and not line.preset.changes
+    return name if usual else f"{name}, {line.preset}"
 
 
 def usual_budgets(lines: Sequence[Line]) -> dict[str, tuple[int, Variant]]:

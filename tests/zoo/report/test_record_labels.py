@@ -54,7 +54,7 @@ def settings_at(commit, suite, preset, changes, method, folder):
         return settings(suite, preset, changes, method)
 
 
-@pytest.mark.parametrize("name", ["baselines", "small-benchmark", "tried"])
+@pytest.mark.parametrize("name", ["baselines", "mid", "small-benchmark", "tried"])
 def test_labels_say_what_ran_at_the_commits_of_their_lines(name, tmp_path):
     lines = [line for line in read(RESULTS / f"{name}.csv") if line.frames]
     assert lines

@@ -4,12 +4,10 @@ from collections.abc import Iterable
 
 import pytest
 
-EVERY = 8
-
 
 def one_in_eight(names: Iterable[str]) -> list:
     """Return the names for `parametrize`; all but every eighth one are marked `nightly`."""
     return [
-        name if i % EVERY == 0 else pytest.param(name, marks=pytest.mark.nightly)
+        name if i % 8 == 0 else pytest.param(name, marks=pytest.mark.nightly)
         for i, name in enumerate(names)
     ]

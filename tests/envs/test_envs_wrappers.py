@@ -1,6 +1,7 @@
 """The wrappers, pixels() around any environment, and the checkers on every task."""
 
 import hashlib
+import os
 import pickle
 import subprocess
 import sys
@@ -200,9 +201,13 @@ def test_rendering_answers_the_last_observation():
 
 def test_the_same_seed_is_the_same_episode_here_and_in_a_fresh_process_and_others_differ():
     code = f"from test_envs_wrappers import *; print([*map(episode_hashes, {FAMILIES!r})])"
-    run = [sys.executable, "-c", code]
-    here = __file__.rpartition("/")[0]
-    answer = subprocess.run(run, check=True, capture_output=True, text=True, cwd=here)
+    answer = subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
     hashes = [episode_hashes(name) for name in FAMILIES]
     assert str(hashes) == answer.stdout.splitlines()[-1]
     for first, other, again in hashes:

@@ -118,7 +118,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         with joined(device) as world:
             seed = pretraining.common_seed(world, seed)
             model = cls(size=size, seed=seed, device=device, **kwargs)
-            checked = None if env is None else model._checked(env)  # not after days of training
+            # Checked now, so that a wrong environment does not fail after days of training.
+            checked = None if env is None else model._checked(env)
             with world.rank_0_first():
                 model.set_dataset(dataset)
             folder = Path(run_dir) if run_dir is not None else None
@@ -128,7 +129,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 model.restore(*saved, same)
                 model.warn_if_late(*saved)
             steps = find_size(model.hyperparameters.size).pretrain_steps if steps is None else steps
-            steps = int(steps)  # of 2e4, too
+            steps = int(steps)  # a float such as 2e4 is allowed
             with model.operations():
                 pretraining.pretrain(
                     model, world, steps, accumulate, folder, progress_bar, callback
@@ -150,16 +151,16 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     ) -> Self:
         """Fine-tune on the task (Algorithm 1): retrieve, clone, then collect and update in turns.
 
-        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. 0
-            makes no step and no update: it only retrieves, and trains the prior actor
+        :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. With
+            0 there is no step and no update, only retrieval and the training of the prior actor
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :param tb_log_name: name of the run's folder in `tensorboard_log`
         :param reset_num_timesteps: count steps and advance schedules from 0 again; False continues
         :param progress_bar: show a progress bar of each stage
         :return: the model itself
-        :raises ValueError: no environment, `total_timesteps` that are no whole number of at least
-            0, or rewards that are not finite
+        :raises ValueError: no environment, `total_timesteps` that are not a whole number of at
+            least 0, or rewards that are not finite
         :raises FloatingPointError: a loss or gradient that is not finite; the weights are kept
         """
         with (
@@ -197,18 +198,18 @@ class WPT(WorldModelAgent, progress=WPTProgress):
                 index, self.dataset, query, width, settings, self.streams
             )
             progress.retrieved_of = self.dataset.fingerprint
-            self.retrieved = None  # those of before, also if the reading below is interrupted
+            self.retrieved = None  # drop the old ones now: the reading below may be interrupted
             if outdated and settings.needs_clone:
-                progress.cloned = False  # a clone is one of what is retrieved
+                progress.cloned = False  # the prior actor was cloned from the old ones
         retrieved = ReplayBuffer()
         ids = progress.retrieved_ids
         trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
         for trajectory in shown(trajectories, len(ids), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
-        self.retrieved = retrieved  # only now, so that an interruption leaves no part of it
+        self.retrieved = retrieved  # only when it is complete, in case of an interruption
 
     def _warn_without_dataset(self) -> None:
-        """Warn of what the missing dataset prevents, if anything."""
+        """Warn if the missing dataset prevents cloning or rehearsal."""
         if not self.progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=4)
         elif self.hyperparameters.offline_ratio:
@@ -261,11 +262,11 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     @property
     def head_start(self) -> int:
-        """How many updates of the head start (`actor_delay`) are left to make."""
+        """Number of updates of the head start (`actor_delay`) that are left to make."""
         return max(self.hyperparameters.actor_delay - self.progress.task_updates, 0)
 
     def steps_per_update(self) -> float:
-        """Return how many collected steps the first update needs; a head start needs none."""
+        """Return how many collected steps the first update needs: none, if a head start is due."""
         return 0.0 if self.head_start else super().steps_per_update()
 
     def updates_due(self) -> int:
@@ -321,14 +322,14 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return max(weight, 1.0) if self.head_start else weight
 
     def begin_residual(self) -> None:
-        """Copy the actor: its difference to this imitator is added to the prior actor's action."""
+        """Copy the actor into the imitator, whose difference from it corrects the prior actor."""
         policy = self.policy
         if policy.imitator is None:
             policy.imitator = deepcopy(policy.actor)
             self.learner.add_imitator()
 
     def averaging(self) -> float:
-        """Return by how much the average actor moves now: it begins after the head start."""
+        """Return the share by which the average actor moves; it begins after the head start."""
         number = self.progress.task_updates - self.hyperparameters.actor_delay + 1
         share = self.hyperparameters.actor_average
         return debiased_fraction(share, number) if share and number > 0 else 0.0
@@ -337,7 +338,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     @property
     def outdated(self) -> bool:
-        """Whether trajectories of another dataset than the present one are retrieved."""
+        """Whether the retrieved trajectories are of another dataset than the present one."""
         progress = self.progress
         other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
         return bool(progress.retrieved_ids) and other

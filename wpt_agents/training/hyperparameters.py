@@ -28,7 +28,7 @@ from wpt_agents.training.keywords import (
     switch,
 )
 
-SIZES_OWN = {  # keywords that are the size's own if None, and the fields of `Size` to read
+SIZES_OWN = {  # keywords that take the size's value if None, and the field of `Size` to read
     "learning_rate": "learning_rate",
     "actor_critic_learning_rate": "actor_critic_learning_rate",
     "imagine_starts": "imagine_starts",
@@ -44,7 +44,7 @@ SIZES_OWN = {  # keywords that are the size's own if None, and the fields of `Si
 
 
 def check_size(name: str, value: Any) -> None:
-    """Refuse what is no size."""
+    """Raise an error if the value is not a size."""
     find_size(value)
 
 
@@ -91,8 +91,8 @@ class Hyperparameters(Keywords):
     )
     data_dependent_init: bool = switch(
         True,
-        "before the first update of a new world model, standardise the inputs of its posterior on "
-        "512 images of the data; not in the paper",
+        "before the first update of a new world model, standardise the inputs of its posterior "
+        "with the statistics of 512 images of the data; not in the paper",
         Stage.SIZE,
     )
     compile: bool = switch(
@@ -266,8 +266,8 @@ class Hyperparameters(Keywords):
     )
     warmup_steps: int | None = count(
         None,
-        "number of first steps, in which the prior actor acts alone (without one, actions are "
-        "uniformly random). None: the size's value, 7,500 for `paper`",
+        "number of steps at the beginning, in which the prior actor acts alone (without one, "
+        "actions are uniformly random). None: the size's value, 7,500 for `paper`",
         Stage.ACTING,
         least=0,
     )
@@ -338,13 +338,13 @@ class Hyperparameters(Keywords):
     )
     bc_learning_rate: float = amount(
         1e-4,
-        "learning rate of the prior actor at its first update; it falls linearly to 0",
+        "learning rate of the prior actor at its first update, from which it falls linearly to 0",
         Stage.CLONING,
     )
     bc_shift: int = count(
         3,
-        "the prior actor's images are shifted by up to this number of pixels at random. The paper "
-        "does not say how far; 3 pixels are the authors'",
+        "largest random shift, in pixels, of the images that the prior actor is trained on. The "
+        "paper does not state it; 3 is the value in the authors' code",
         Stage.CLONING,
         least=0,
     )
@@ -399,7 +399,7 @@ class Hyperparameters(Keywords):
         return self.imitates or self.ibrl or self.residual or ever(self._schedule("guidance"))
 
     def pessimism_at(self, step: int) -> float:
-        """Return what the reward heads' deviation is multiplied by at this step."""
+        """Return the factor β on the standard deviation of the reward heads at this step."""
         return self._schedule("pessimism")(step)
 
     def guidance_at(self, step: int) -> float:

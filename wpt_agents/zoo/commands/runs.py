@@ -21,7 +21,11 @@ Data = Annotated[
     Path | None, typer.Option(help="A dataset to use instead of collecting the preset's data.")
 ]
 Seeds = Annotated[
-    str, typer.Option(help="The number of seeds (`3` is 0, 1, 2), or which ones (`0,5` or `0-2`).")
+    str,
+    typer.Option(
+        help="The number of seeds (`3` is 0, 1, 2), or which ones: `0,5`, `0-2`, or `1-1` for seed "
+        "1 alone."
+    ),
 ]
 MethodNames = Annotated[
     list[str],
@@ -48,7 +52,7 @@ Record = Annotated[
     Path | None,
     typer.Option(
         help="A CSV file to which each run is added as soon as it is finished, as by `report "
-        "--record`; with --dry-run, the runs that it has are marked."
+        "--record`; with --dry-run, the runs that are already in it are marked."
     ),
 ]
 Force = Annotated[bool, typer.Option(help="Replace finished runs.")]
@@ -82,7 +86,7 @@ Memory = Annotated[
 Hours = Annotated[
     float,
     typer.Option(
-        help="The time limit of a Slurm job in hours; unfinished runs continue in another."
+        help="The time limit of a Slurm job in hours; unfinished runs continue in another job."
     ),
 ]
 Retries = Annotated[

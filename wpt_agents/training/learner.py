@@ -258,8 +258,8 @@ class Learner(WorldModelLearner):
     ) -> Metrics:
         """Take a step on Eq. (4) and the imitation, or in the head start on the imitation alone.
 
-        Without a prior actor to imitate, the actor rests during the head start: reward head and
-        critic learn first.
+        Without a prior actor to imitate, the actor is not updated during the head start: reward
+        head and critic learn first.
 
         :param scale: what returns are divided by
         :param imitation: added to the loss, but not to the metric of it

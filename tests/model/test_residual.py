@@ -85,6 +85,18 @@ def test_the_imitator_learns_beside_the_others_and_changes_none_of_them(data, tm
     assert not any(torch.equal(imitator[f"imitator.{k[6:]}"], w) for k, w in before.items())
 
 
+@pytest.mark.parametrize("kickstart", [5.0, "linear(5,1,100)"])
+def test_without_imagination_the_imitator_stays_equal_to_the_actor(data, kickstart):
+    model = learned(data, train_ratio=1e-9, kickstart=kickstart)
+    model.learner.actor_loss = lambda dream, *_: 0 * dream.entropy.sum()
+    before = weights(model, "actor.")
+    for _ in range(3):
+        model.update(defaultdict(list))
+    actor, imitator = weights(model, "actor."), weights(model, "imitator.")
+    assert not same(before, actor)
+    assert same(actor, {name.replace("imitator.", "actor."): w for name, w in imitator.items()})
+
+
 def test_the_imitator_has_the_rate_of_the_actor_from_its_first_update_on(data):
     model = learned(data, train_ratio=1e-9, actor_critic_decay=True)
     model.num_timesteps = 4 * LENGTH // 5

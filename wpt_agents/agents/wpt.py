@@ -325,7 +325,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         policy = self.policy
         if policy.imitator is None:
             policy.imitator = deepcopy(policy.actor)
-            self.learner.add_imitator()
+            self.learner.begin_imitator()
 
     def averaging(self) -> float:
         """Return by how much the average actor moves now: it begins after the head start."""

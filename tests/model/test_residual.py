@@ -37,7 +37,7 @@ def test_the_mean_is_the_clones_plus_what_the_actor_has_learned():
 
     policy = SimpleNamespace(
         prior_actor=SimpleNamespace(act=lambda frames, _: torch.tensor([[0.5, 0.9, 0.0]])),
-        imitator=SimpleNamespace(dist=lambda feat, _: normal([0.25, 0.5, 0.0], [1.0, 1.0, 1.0])),
+        acting_imitator=SimpleNamespace(dist=lambda *_: normal([0.25, 0.5, 0.0], [1.0] * 3)),
         action_mask=mask,
     )
     actor = normal([0.5, 1.0, 0.0], [0.25, 0.5, 0.1])
@@ -83,6 +83,37 @@ def test_the_imitator_learns_beside_the_others_and_changes_none_of_them(data, tm
     assert imitator and same(plain, {k: w for k, w in corrected.items() if k not in imitator})
     before = weights(model, "actor.")
     assert not any(torch.equal(imitator[f"imitator.{k[6:]}"], w) for k, w in before.items())
+
+
+@pytest.mark.parametrize("kickstart", [5.0, "linear(5,1,100)"])
+def test_without_imagination_the_imitator_stays_equal_to_the_actor(data, kickstart):
+    model = learned(data, train_ratio=1e-9, kickstart=kickstart)
+    model.learner.actor_loss = lambda dream, *_: 0 * dream.entropy.sum()
+    before = weights(model, "actor.")
+    for _ in range(3):
+        model.update(defaultdict(list))
+    actor, imitator = weights(model, "actor."), weights(model, "imitator.")
+    assert not same(before, actor)
+    assert same(actor, {name.replace("imitator.", "actor."): w for name, w in imitator.items()})
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_without_imagination_the_clone_acts_also_with_averages(data, later, tmp_path):
+    settings = {"actor_average": 0.25, "residual": not later}
+    model = learned(data, train_ratio=1e-9, kickstart=5.0, **settings)
+    model.learner.actor_loss = lambda dream, *_: 0 * dream.entropy.sum()
+    for switch in (not later, True):
+        model.residual = switch
+        for _ in range(2):
+            model.update(defaultdict(list))
+    model.save(tmp_path / "model")
+    loaded = WPT.load(tmp_path / "model")
+    image = noise(1)
+    prior = prior_action(model.policy, stack_frames(image, None, None))
+    for policy in (model.policy, loaded.policy):
+        assert policy.acting_actor is not policy.actor and policy.imitator is not None
+        action, _ = policy.act(image, None, None, deterministic=True)
+        np.testing.assert_allclose(action, prior, atol=1e-6)
 
 
 def test_the_imitator_has_the_rate_of_the_actor_from_its_first_update_on(data):

@@ -11,7 +11,6 @@ Example::
 import os
 import warnings
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -322,11 +321,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return max(weight, 1.0) if self.head_start else weight
 
     def begin_residual(self) -> None:
-        """Copy the actor into the imitator, whose difference from it corrects the prior actor."""
-        policy = self.policy
-        if policy.imitator is None:
-            policy.imitator = deepcopy(policy.actor)
-            self.learner.add_imitator()
+        """Add what the actor learns from now on to the prior actor's action (`residual`)."""
+        if self.policy.imitator is None:
+            self.policy.begin_residual()
+            self.learner.begin_imitator()
 
     def averaging(self) -> float:
         """Return the share by which the average actor moves; it begins after the head start."""

@@ -1,5 +1,7 @@
 """Learning to act in imagination (A.3): Eq. (2) lambda_return, (3) critic_loss, (4) actor_loss."""
 
+from copy import deepcopy
+
 import torch
 from torch import Generator, Tensor, nn
 
@@ -208,6 +210,16 @@ class Actor(Head):
         # These bounds are the authors', the paper does not print them.
         # The 2 makes exploration wide at first: a network that outputs 0 has a deviation of 0.89.
         return TruncatedNormal(torch.tanh(mean), 0.9 * torch.sigmoid(std + 2) + 0.1, mask)
+
+
+def averaged(average: Actor | None, actor: Actor | None, fraction: float) -> Actor | None:
+    """Move an average towards an actor by `fraction`, or begin it; None without either."""
+    if actor is None or not fraction:
+        return None
+    if average is None:
+        return deepcopy(actor).requires_grad_(False)
+    ema_update(average, actor, fraction)
+    return average
 
 
 class Critic(Head):

@@ -23,7 +23,7 @@ class Chooser(Protocol):
     world_model: WorldModel
     target_critic: Critic
     prior_actor: PriorActor
-    imitator: Actor | None
+    acting_imitator: Actor | None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
 
 
@@ -84,6 +84,6 @@ def corrected(
     """
     mask = policy.action_mask
     prior_action = policy.prior_actor.act(frames, mask)
-    imitator = policy.imitator
+    imitator = policy.acting_imitator
     imitation = dist.mean if imitator is None else imitator.dist(state.feat, mask).mean
     return TruncatedNormal((prior_action + (dist.mean - imitation)).clamp(-1, 1), dist.std, mask)

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from torch import Generator, Tensor
 
 from wpt_agents.data.trajectory import Trajectory, led_to, stack_windows
-from wpt_agents.model.actor_critic import Actor, Critic, ema_update
+from wpt_agents.model.actor_critic import Actor, Critic, averaged
 from wpt_agents.model.behavior_cloning import FRAMES, PriorActor
 from wpt_agents.model.choosing import actor_or_prior, corrected
 from wpt_agents.model.distributions import BIN_RANGE, Noise
@@ -58,6 +58,7 @@ class WPTPolicy(PixelPolicy):
 
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
     imitator: Actor | None  # the actor without imagination: an imitation of the prior actor alone
+    average_imitator: Actor | None  # of `imitator`, beside the average of `actor`
     return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
     updates: int  # raised whenever weights have changed: caches of them look at it
 
@@ -108,6 +109,7 @@ class WPTPolicy(PixelPolicy):
         self.target_critic.requires_grad_(False).load_state_dict(self.critic.state_dict())
         self.average_actor = None
         self.imitator = None
+        self.average_imitator = None
         self.prior_actor = PriorActor(size, self.max_action_dim).to(device)
         self.return_scale.fill_(0)
         self.updates += 1
@@ -117,13 +119,14 @@ class WPTPolicy(PixelPolicy):
     ) -> Any:
         """Load weights, as `torch.nn.Module.load_state_dict`.
 
-        Afterwards there are an average actor and an imitator if the weights have them.
+        Afterwards there are an imitator and averages if the weights have them.
         """
         self.updates += 1
         if not hasattr(self, "curiosity"):  # an explorer's, which does not take part in acting
             state_dict = {k: v for k, v in state_dict.items() if not k.startswith("curiosity.")}
-        averaged = any(name.startswith("average_actor.") for name in state_dict)
-        self.average_actor = deepcopy(self.actor).requires_grad_(False) if averaged else None
+        for average in ("average_actor", "average_imitator"):
+            there = any(name.startswith(f"{average}.") for name in state_dict)
+            setattr(self, average, deepcopy(self.actor).requires_grad_(False) if there else None)
         imitates = any(name.startswith("imitator.") for name in state_dict)
         if imitates != (self.imitator is not None):
             self.imitator = deepcopy(self.actor) if imitates else None
@@ -144,14 +147,20 @@ class WPTPolicy(PixelPolicy):
         """The actor that decides in the environment; dreams are always the actor's that learns."""
         return self.actor if self.average_actor is None else self.average_actor
 
+    @property
+    def acting_imitator(self) -> Actor | None:
+        """The imitator to compare `acting_actor` with, averaged if that is."""
+        return self.imitator if self.average_imitator is None else self.average_imitator
+
+    def begin_residual(self) -> None:
+        """Copy the actor: its difference to this imitator is added to the prior actor's action."""
+        self.imitator = deepcopy(self.actor)
+        self.average_imitator = deepcopy(self.average_actor)
+
     def average(self, fraction: float) -> None:
-        """Move the average actor towards the actor by `fraction`; 0 drops it."""
-        if not fraction:
-            self.average_actor = None
-        elif self.average_actor is None:
-            self.average_actor = deepcopy(self.actor).requires_grad_(False)
-        else:
-            ema_update(self.average_actor, self.actor, fraction)
+        """Move the averages towards actor and imitator by `fraction`; 0 drops them."""
+        self.average_actor = averaged(self.average_actor, self.actor, fraction)
+        self.average_imitator = averaged(self.average_imitator, self.imitator, fraction)
         self.updates += 1
 
     def initial_state(self, n: int) -> State:

@@ -1,5 +1,6 @@
 """// Update Models of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
 
+from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
 
@@ -92,6 +93,17 @@ class Learner(WorldModelLearner):
             parts = [list(imitator.parameters())]
             self.imitator_optimizer = self.adam(parts, self.actor_critic_rate)
 
+    def begin_imitator(self) -> None:
+        """Make the optimiser of an imitator that was just copied from the actor.
+
+        It takes over the averages of the actor's. With averages of its own, the first steps would
+        be large, and the imitator would differ from the actor without any imagination.
+        """
+        self.add_imitator()
+        assert self.imitator_optimizer is not None
+        state = self.actor_optimizer.state_dict()
+        self.imitator_optimizer.load_state_dict(deepcopy(state))  # torch would share the averages
+
     def update(
         self,
         batch: Batch,
@@ -115,7 +127,8 @@ class Learner(WorldModelLearner):
         post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
-            loss = self.imitation_loss(imitator, post, advice)
+            # Weighted as for the actor, so that the two differ by what imagination changes alone.
+            loss = (imitation_weight or 1.0) * self.imitation_loss(imitator, post, advice)
             self.descend(self.imitator_optimizer, loss, "imitator")
         imitation: Tensor | float = 0.0
         if advice is not None and imitation_weight:

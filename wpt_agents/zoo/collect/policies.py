@@ -8,6 +8,7 @@ import numpy as np
 import stable_baselines3 as sb3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.jsrl import JSRL
 from wpt_agents.agents.mrq import MRQ
@@ -17,6 +18,7 @@ from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.model_file import agent_of
 from wpt_agents.files.names import unknown_name
+from wpt_agents.model.observations import State
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "wpt": WPT,
@@ -49,6 +51,25 @@ def sees_states(name: str) -> bool:
     return len(load_policy(name).observation_space.shape or ()) == 1
 
 
+def executed(agent: object, state: State | None, action: np.ndarray) -> State | None:
+    """Return an agent's recurrent state after another action than its own was executed.
+
+    The world model predicts from actions, so WPT has to see it. Other states do not depend on them.
+
+    :param agent: anything with `predict`
+    :param state: what `predict` returned
+    :param action: (A,) or (n, A) in [-1, 1]
+    """
+    if not isinstance(agent, PixelAgent) or state is None:
+        return state
+    policy = agent.policy
+    batch = np.atleast_2d(action)
+    padded = np.zeros((len(batch), len(policy.action_mask)), np.float32)
+    padded[:, : batch.shape[1]] = batch
+    after: State = policy.executed(state, padded)
+    return after
+
+
 class SavedPolicy:
     """The deterministic policy's actions in [-1, 1] for one episode, with Gaussian noise.
 
@@ -60,7 +81,7 @@ class SavedPolicy:
         self.model = load_policy(name)
         self.sigma = sigma
         self.sees_states = sees_states(name)
-        self.state: tuple[np.ndarray, ...] | None = None
+        self.state: State | None = None
         if self.model.action_space.shape != (width,):
             raise ValueError(
                 f"{name} acts in {self.model.action_space}, the task takes {width} actions; pass a "
@@ -73,4 +94,6 @@ class SavedPolicy:
         start = np.array([step == 0])
         action, self.state = self.model.predict(seen, self.state, start, deterministic=True)
         action = self.model.policy.scale_action(action)
-        return np.clip(action + self.rng.normal(0, self.sigma, len(action)), -1, 1)
+        noisy = np.clip(action + self.rng.normal(0, self.sigma, len(action)), -1, 1)
+        self.state = executed(self.model, self.state, noisy)
+        return noisy

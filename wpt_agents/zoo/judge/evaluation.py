@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.zoo.collect.behaviours import Act
+from wpt_agents.zoo.collect.policies import executed
 from wpt_agents.zoo.judge.untrained import State
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.terminal import progress
@@ -73,6 +74,8 @@ def evaluate(
 class NoisyPolicy:
     """A policy with Gaussian noise on its actions, to see how precise they have to be.
 
+    As in training, the policy's recurrent state is that of the actions with noise.
+
     :param policy: its actions are in [-1, 1], as those of all tasks of the zoo
     :param std: standard deviation of the noise; actions are clipped to [-1, 1] afterwards
     :param seed: seed of the noise
@@ -92,7 +95,8 @@ class NoisyPolicy:
         """Return the policy's action with noise, and its next state."""
         action, state = self.policy.predict(observation, state, episode_start, deterministic)
         noise = self.std * self.rng.standard_normal(action.shape)
-        return np.clip(action + noise, -1, 1).astype(action.dtype), state
+        noisy = np.clip(action + noise, -1, 1).astype(action.dtype)
+        return noisy, executed(self.policy, state, noisy)
 
 
 def acting(policy: PolicyPredictor) -> Act:

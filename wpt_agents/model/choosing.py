@@ -23,8 +23,11 @@ class Chooser(Protocol):
     world_model: WorldModel
     target_critic: Critic
     prior_actor: PriorActor
-    acting_imitator: Actor | None
     action_mask: Tensor  # (A,) bool, True at the embodiment's own entries
+
+    @property
+    def acting_imitator(self) -> Actor | None:
+        """The imitator of the prior actor, if there is one yet."""
 
 
 def choose_by_value(

@@ -47,19 +47,19 @@ def measured(settings: argparse.Namespace, task: str, seed: int, variant: str) -
     """Clone a prior actor and evaluate it; return its success rate, return and CPU seconds."""
     name = f"wpt/metaworld-{task}-v0"
     words = [word for word in variant.split() if word != "constant"]
+    keywords = {"num_retrieve": settings.retrieve, "bc_steps": settings.steps}
+    keywords |= {key: yaml.safe_load(value) for key, value in (w.split("=") for w in words)}
     model = WPT(
         "WPTPolicy",
         gym.make(name, **FAST),
         dataset=settings.data / task,
         size=settings.size,
         max_action_dim=4,
-        num_retrieve=settings.retrieve,
-        bc_steps=settings.steps,
         bc_batch_size=64,
         bc_learning_rate=1e-3,
         seed=seed,
         device="cpu",
-        **{key: yaml.safe_load(value) for key, value in (word.split("=") for word in words)},
+        **keywords,
     )
     start = time.process_time()
     with patch(RATES, constant) if "constant" in variant else nullcontext():

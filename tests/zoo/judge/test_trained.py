@@ -23,10 +23,10 @@ from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import Diagnosis, Promise, promises, show
 from wpt_agents.zoo.judge.evaluation import NoisyPolicy
-from wpt_agents.zoo.judge.trained import Origin, find_trained
+from wpt_agents.zoo.judge.trained import Origin, Trained, find_trained
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.hub import card, pull, push
-from wpt_agents.zoo.result import read_result
+from wpt_agents.zoo.result import Score, read_result
 from wpt_agents.zoo.run.runner import run
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -87,6 +87,14 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
         "wpt_agents.zoo.judge.trained.read_origin", lambda _: Origin("", SECTIONS["env"])
     )
     assert call(monkeypatch, "eval", model, *words) == 0
+
+
+def test_eval_names_the_initial_states_where_a_policy_fails(moved, monkeypatch, capsys):
+    folder, *_ = moved
+    score = Score((1.0, 2.0, 3.0), (False, True, False))
+    monkeypatch.setattr(Trained, "evaluate", lambda *_: score)
+    assert call(monkeypatch, "eval", folder, "--episodes", "3", "--seed", "20") == 0
+    assert "failures         seeds 20, 22 (" in capsys.readouterr().out
 
 
 def test_noise_on_the_actions_is_of_the_asked_size_and_seeded():

@@ -368,6 +368,30 @@ def test_success_at_any_step_is_counted_beside_that_at_the_last(monkeypatch):
     assert (score.success_rate, score.success_rate_any) == (0.0, 1.0)
 
 
+def test_scores_are_in_the_order_of_seeds_even_if_later_episodes_end_earlier(monkeypatch):
+    class Shorter(toy_env.DotEnv):
+        """Ends the earlier, the higher its seed is; its return is its length."""
+
+        def reset(self, *, seed=None, options=None):
+            self.length = 12 - seed if seed is not None else self.length
+            return super().reset(seed=seed)
+
+        def step(self, action):
+            obs, _, _, _, info = super().step(action)
+            return obs, 1.0, self.time == self.length, False, info | {"is_success": self.length > 5}
+
+    def make(_, __, seed, number):
+        venv = DummyVecEnv([lambda: Monitor(Shorter()) for _ in range(number)])
+        venv.seed(seed)
+        return venv
+
+    monkeypatch.setattr(evaluation, "make_vec_env", make)
+    monkeypatch.setattr(evaluation, "PARALLEL", 3)
+    score = evaluate(DoNothing(toy_env.DotEnv().action_space), DOT.id, {}, 5, 4)
+    assert score.returns == (8, 7, 6, 5, 4)
+    assert score.successes == (True, True, True, False, False)
+
+
 def test_training_logs_success_where_the_task_counts_it(tmp_path):
     path = tmp_path / "0.monitor.csv"
     env = {"rendering": "fast"}

@@ -82,6 +82,9 @@ def evaluate_model(
         ever = score.success_rate_any
         at_any_step = "" if ever is None else f"; {ever:.2f} at any step"
         typer.echo(f"success          {score.success_rate:.2f} at the last step{at_any_step}")
+        failed = [str(seed + i) for i, success in enumerate(score.successes) if not success]
+        if failed:
+            typer.echo(f"failures         seeds {', '.join(failed)} (enjoy --seed shows one)")
 
 
 def enjoy_model(

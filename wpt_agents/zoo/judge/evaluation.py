@@ -45,30 +45,37 @@ def evaluate(
     Policies that are evaluated with the same `seed` start from the same initial states.
 
     :param wrap: the wrapper that the policy needs around its environments
+    :return: the score of the episodes in the order of their seeds, `seed`, `seed + 1`, ...
     """
     returns: list[float] = []
-    successes: list[bool] = []
-    successes_any: list[bool] = []
+    successes: dict[int, bool] = {}  # by episode: those of a batch may end in any order
+    successes_any: dict[int, bool] = {}
+    first, ended = 0, list[int]()  # of a batch: its first episode, and those that have ended
     steps = episode_steps(task, env)
     with progress(steps and steps * episodes, f"evaluate {label}".strip(), "steps") as bar:
 
         def watch(local: dict[str, Any], _: dict[str, Any]) -> None:
             bar.update(1)
-            info = local["info"]
-            if local["done"] and "is_success" in info:
-                successes.append(bool(info["is_success"]))
-            if local["done"] and "success_any" in info:
-                successes_any.append(bool(info["success_any"]))
+            if not local["done"]:
+                return
+            episode, info = first + local["i"], local["info"]
+            ended.append(episode)
+            if "is_success" in info:
+                successes[episode] = bool(info["is_success"])
+            if "success_any" in info:
+                successes_any[episode] = bool(info["success_any"])
 
         for first in range(0, episodes, PARALLEL):
+            ended.clear()
             number = min(PARALLEL, episodes - first)
             venv = make_vec_env(task, env, seed + first, number)
             with closing(wrap(venv) if wrap else venv) as wrapped:
                 earned, _ = evaluate_policy(
                     policy, wrapped, number, callback=watch, return_episode_rewards=True
                 )
-            returns += np.asarray(earned, float).tolist()
-    return Score(tuple(returns), tuple(successes), tuple(successes_any))
+            returns += np.asarray(earned, float)[np.argsort(ended)].tolist()
+    reached, ever = ([by[i] for i in sorted(by)] for by in (successes, successes_any))
+    return Score(tuple(returns), tuple(reached), tuple(ever))
 
 
 class NoisyPolicy:

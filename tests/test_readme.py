@@ -146,6 +146,7 @@ def test_every_logged_value_is_explained_and_no_other(monkeypatch):
     # by default.
     unseen = {"rollout/success_rate", "rollout/reward_per_step", "train/continue_loss"}
     unseen |= {"train/kickstart_loss", "train/reward_disagreement"}
+    unseen |= {"train/correction", "train/imitator_loss"}
     assert explained == seen | unseen
 
 

@@ -97,6 +97,25 @@ def test_without_imagination_the_imitator_stays_equal_to_the_actor(data, kicksta
     assert same(actor, {name.replace("imitator.", "actor."): w for name, w in imitator.items()})
 
 
+def test_the_size_of_the_correction_is_logged(data):
+    model = learned(data, train_ratio=1e-9, kickstart=5.0)
+    metrics = defaultdict(list)
+    model.update(metrics)
+    model.update(metrics)
+    first, second = metrics["train/correction"]
+    assert first == 0 < second  # before the first update the imitator is a copy of the actor
+    assert metrics["train/imitator_loss"][0] == metrics["train/kickstart_loss"][-2] > 0
+    policy = model.policy
+    imitator = policy.imitator
+    with torch.no_grad():
+        list(imitator.parameters())[-1][0] += 0.5
+        post = policy.world_model.rssm.initial(4)
+        post = Latent(*(part[None] for part in post))
+        added = [a.dist(post.feat[0], policy.action_mask).mean for a in (policy.actor, imitator)]
+    expected = np.sqrt(np.mean(np.square((added[0] - added[1])[:, :2].numpy())))
+    assert model.learner.correction(imitator, post).item() == pytest.approx(expected) and expected
+
+
 @pytest.mark.parametrize("later", [False, True])
 def test_without_imagination_the_clone_acts_also_with_averages(data, later, tmp_path):
     settings = {"actor_average": 0.25, "residual": not later}

@@ -127,9 +127,11 @@ class Learner(WorldModelLearner):
         post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         if advice is not None and imitator is not None and self.imitator_optimizer is not None:
+            metrics["train/correction"] = self.correction(imitator, post)
             # Weighted as for the actor, so that the two differ by what imagination changes alone.
-            loss = (imitation_weight or 1.0) * self.imitation_loss(imitator, post, advice)
-            self.descend(self.imitator_optimizer, loss, "imitator")
+            loss = self.imitation_loss(imitator, post, advice)
+            metrics["train/imitator_loss"] = loss.detach()
+            self.descend(self.imitator_optimizer, (imitation_weight or 1.0) * loss, "imitator")
         imitation: Tensor | float = 0.0
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
@@ -167,6 +169,15 @@ class Learner(WorldModelLearner):
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
         with self.autocast():
             return bc_loss(actor.dist(feat, mask).mode, advice, mask)
+
+    @torch.no_grad()
+    def correction(self, imitator: Actor, post: Latent) -> Tensor:
+        """Return the root mean square of what `residual` adds to the prior actor's actions."""
+        mask = self.policy.action_mask
+        feat = post.feat.flatten(0, 1)
+        with self.autocast():
+            added = self.policy.actor.dist(feat, mask).mean - imitator.dist(feat, mask).mean
+        return added[:, mask].square().mean().sqrt()
 
     def states_loss(self, post: Latent, advice: Tensor) -> Tensor:
         """Return the loss by which imitation trains the states, weighted; the actor is fixed."""

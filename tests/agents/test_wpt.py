@@ -32,6 +32,7 @@ from wpt_agents.model.observations import stack_frames
 from wpt_agents.model.ops import definitions
 from wpt_agents.model.prior_policy import prior_action
 from wpt_agents.training import cloning, pretraining
+from wpt_agents.training.kickstarting import Adaptive
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.rollout import Rollout
@@ -954,6 +955,21 @@ def test_kickstarting_is_the_squared_distance_to_the_prior_actor_by_its_schedule
     assert model.num_timesteps == 50  # half way from 20 to 0
     assert model.hyperparameters.kickstart_at(50) == 10
     assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-4)
+
+
+def test_the_adaptive_weight_goes_by_the_returns_since_the_warm_up(store):
+    settings = {"kickstart": "adaptive(20,1)", "warmup_steps": LENGTH, "train_ratio": 8}
+    model = pretrained(store, env=DotEnv(), **settings).learn(4 * LENGTH)
+    by_hand = [float(episode.reward.sum()) for episode in model.replay_buffer.trajectories]
+    assert model.collected_returns() == (by_hand[:1], by_hand[1:]) and len(by_hand) == 4
+    expected = Adaptive(20, 1).weight(by_hand[:1], by_hand[1:])
+    assert model.imitation_weight() == expected
+    metrics = defaultdict(list)
+    model.update(metrics)
+    assert metrics["train/kickstart_weight"][0].item() == pytest.approx(expected)
+    for episode in model.replay_buffer.trajectories[1:]:
+        episode.reward[:] -= 1  # now they are worse than the warm-up's
+    assert model.imitation_weight() == 20
 
 
 def moved_by(model, keyword, value):

@@ -316,9 +316,24 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Return the weight of the loss by which the actor imitates the prior actor."""
         if not self.progress.cloned:
             return 0.0
-        weight = self.hyperparameters.kickstart_at(self.num_timesteps)
+        weight = self.hyperparameters.kickstart_at(self.num_timesteps, *self.collected_returns())
         # In the head start it is the only term of the loss, so any weight will do.
         return max(weight, 1.0) if self.head_start else weight
+
+    def collected_returns(self) -> tuple[list[float], list[float]]:
+        """Return the returns of the collected trajectories, of the warm-up and of later ones.
+
+        With several environments it depends on the order in which episodes end which of those
+        around the end of the warm-up belong to it.
+        """
+        returns: tuple[list[float], list[float]] = ([], [])
+        start = 0  # the number of steps before a trajectory
+        for trajectory in self.replay_buffer.trajectories:
+            if trajectory.reward is not None:
+                later = start >= self.hyperparameters.value("warmup_steps")
+                returns[later].append(float(trajectory.reward.sum()))
+            start += len(trajectory)
+        return returns
 
     def begin_residual(self) -> None:
         """Add what the actor learns from now on to the prior actor's action (`residual`)."""

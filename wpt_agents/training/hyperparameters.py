@@ -4,7 +4,8 @@ A new keyword is declared here and used in one other place. The signature of `WP
 its documentation, its checks and the zoo's list of what pre-training depends on follow from it.
 """
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -27,6 +28,7 @@ from wpt_agents.training.keywords import (
     share,
     switch,
 )
+from wpt_agents.training.kickstarting import Adaptive, check_kickstart, parse_kickstart
 
 SIZES_OWN = {  # keywords that take the size's value if None, and the field of `Size` to read
     "learning_rate": "learning_rate",
@@ -192,11 +194,13 @@ class Hyperparameters(Keywords):
     offline_ratio: float = share(
         0.25, "share of retrieved sequences in a batch (experience rehearsal); 0: no rehearsal"
     )
-    kickstart: str | float = schedule(
+    kickstart: str | float = keyword(
         0.0,
-        np.inf,
+        check_kickstart,
         "weight, or a schedule of it, of a loss with which the actor imitates the prior actor on "
-        "replayed images; not in the paper. 0: off; if the prior actor is good, try 20",
+        "replayed images; not in the paper. 0: off; if the prior actor is good, try 20. "
+        "'adaptive(20,1)' falls from 20 to 1 while the newest episodes return about as much as "
+        "those of the warm-up, which the prior actor drove, and rises again while they do not",
     )
     actor_delay: int = count(
         0,
@@ -391,7 +395,7 @@ class Hyperparameters(Keywords):
     @property
     def imitates(self) -> bool:
         """Whether the actor ever imitates the prior actor in its loss."""
-        return ever(self._schedule("kickstart"))
+        return self.kickstart_at(0) > 0 or self.kickstart_at(sys.maxsize) > 0
 
     @property
     def needs_clone(self) -> bool:
@@ -410,9 +414,16 @@ class Hyperparameters(Keywords):
         """Return the weight of the entropy at this step."""
         return self._schedule("ent_coef")(step)
 
-    def kickstart_at(self, step: int) -> float:
-        """Return the weight of the imitation loss at this step."""
-        return self._schedule("kickstart")(step)
+    def kickstart_at(
+        self, step: int, prior: Sequence[float] = (), later: Sequence[float] = ()
+    ) -> float:
+        """Return the weight of the imitation loss at this step, after episodes of these returns.
+
+        :param prior: of the episodes that the prior actor drove
+        :param later: of the episodes after these
+        """
+        weight = parse_kickstart(self.kickstart)
+        return weight.weight(prior, later) if isinstance(weight, Adaptive) else weight(step)
 
     def _schedule(self, name: str) -> Schedule:
         """Return a keyword as a function of the step; its range was checked before."""

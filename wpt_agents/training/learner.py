@@ -136,6 +136,7 @@ class Learner(WorldModelLearner):
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
             metrics["train/kickstart_loss"] = loss.detach()
+            metrics["train/kickstart_weight"] = torch.full_like(loss.detach(), imitation_weight)
             imitation = imitation_weight * loss
         replay_loss: Tensor | float = 0.0
         if settings.repval_scale:

@@ -126,7 +126,7 @@ class Run:
             return self.algorithm.needs_data
         wpt = SimpleNamespace(**self.full_keywords)
         guided = ever(parse_schedule(wpt.guidance))
-        imitates = ever(parse_schedule(wpt.kickstart, np.inf))
+        imitates = WPT.keywords(kickstart=wpt.kickstart).imitates
         return bool(wpt.offline_ratio) or guided or imitates or wpt.ibrl or wpt.residual
 
     @property

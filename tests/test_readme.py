@@ -145,7 +145,7 @@ def test_every_logged_value_is_explained_and_no_other(monkeypatch):
     # A dot reports no success, its episodes are short and do not terminate, and the others are off
     # by default.
     unseen = {"rollout/success_rate", "rollout/reward_per_step", "train/continue_loss"}
-    unseen |= {"train/kickstart_loss", "train/reward_disagreement"}
+    unseen |= {"train/kickstart_loss", "train/kickstart_weight", "train/reward_disagreement"}
     unseen |= {"train/correction", "train/imitator_loss"}
     assert explained == seen | unseen
 

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from wpt_agents.agents.base import PixelAgent
+from wpt_agents.agents.jsrl import JSRL
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.zoo.plan import presets
 from wpt_agents.zoo.plan.methods import METHODS, defaults
@@ -59,6 +60,13 @@ def test_the_paper_preset_is_table_2():
 def test_guidance_of_meta_world_falls_over_twice_the_run_as_in_the_paper(name):
     preset = load_preset("metaworld", name)
     assert preset.wpt["guidance"] == f"linear(1,0.1,{2 * preset.steps})"
+
+
+@pytest.mark.parametrize(("suite", "name"), ALL)
+def test_the_clone_of_jsrl_drives_no_warm_up(suite, name):
+    # horizons alone decide where the clone acts, as in appendix G of the paper's later version
+    preset = load_preset(suite, name)
+    assert {**defaults(JSRL), **preset.of_agent(JSRL)}["warmup_steps"] == 0
 
 
 def test_frames_become_calls_of_step_by_the_action_repeat():

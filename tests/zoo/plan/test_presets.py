@@ -11,8 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from wpt_agents.agents.base import PixelAgent
+from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.jsrl import JSRL
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.zoo.plan import presets
 from wpt_agents.zoo.plan.methods import METHODS, defaults
 from wpt_agents.zoo.plan.presets import (
@@ -67,6 +69,13 @@ def test_the_clone_of_jsrl_drives_no_warm_up(suite, name):
     # horizons alone decide where the clone acts, as in appendix G of the paper's later version
     preset = load_preset(suite, name)
     assert {**defaults(JSRL), **preset.of_agent(JSRL)}["warmup_steps"] == 0
+
+
+@pytest.mark.parametrize(("suite", "name"), [x for x in ALL if x[1] in ("demo", "tiny", "mid")])
+def test_the_noise_of_drqv2_has_faded_by_the_middle_of_a_short_run(suite, name):
+    preset = load_preset(suite, name)
+    std = parse_schedule(preset.of_agent(DrQv2)["std"], np.inf)
+    assert std(0) == 1.0 and std(preset.steps // 2) == pytest.approx(0.1)
 
 
 def test_frames_become_calls_of_step_by_the_action_repeat():

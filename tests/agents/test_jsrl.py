@@ -117,6 +117,14 @@ def test_trajectories_of_another_dataset_are_cloned_again(dataset):
     assert not same(clone, weights(model, "prior_actor"))
 
 
+@pytest.mark.filterwarnings("ignore:.*without offline data")
+def test_a_warm_up_is_said_to_be_the_clones_if_there_is_one(dataset):
+    with pytest.warns(UserWarning, match=r"nothing but the clone's actions: warmup_steps=100\."):
+        agent(dataset, warmup_steps=100).learn(60)
+    with pytest.warns(UserWarning, match="nothing but random actions"):
+        agent(None, warmup_steps=100).learn(60)
+
+
 def test_without_a_dataset_it_warns_and_learns_as_drqv2():
     with pytest.warns(UserWarning, match="without offline data"):
         model = agent(None).learn(60)

@@ -132,6 +132,12 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         """The clone, with `predict`; None before it is trained."""
         return PriorPolicy(self.policy) if self.progress.cloned else None
 
+    @property
+    def warmup_driver(self) -> str:
+        """What chooses the actions in the warm-up, in words."""
+        clones = self.progress.cloned or self.dataset is not None
+        return "the clone's actions" if clones else super().warmup_driver
+
     def guidance_window(self, rng: np.random.Generator) -> Window:
         """Return the steps of a new episode that the clone drives: 0 .. h - 1."""
         return (0, int(rng.choice(HORIZONS))) if self.progress.cloned else (0, 0)

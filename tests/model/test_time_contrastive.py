@@ -61,6 +61,17 @@ def test_clips_are_in_order_and_reach_all_images():
     assert set(s0.tolist()) == set(range(5)) and set(s2.tolist()) == set(range(1, 6))
 
 
+def test_the_middle_image_of_a_clip_is_equally_likely_anywhere():
+    draws = draw_clips(
+        np.array([4]), lambda _, times: np.array(times), 8000, np.random.default_rng(0)
+    )
+    s0, s1, s2 = draws.T.numpy()
+    np.testing.assert_allclose(np.bincount(s1)[1:] / 8000, [1 / 4] * 4, atol=0.02)
+    # of the images before and from 3 on
+    np.testing.assert_allclose(np.bincount(s0[s1 == 3]) / (s1 == 3).sum(), [1 / 3] * 3, atol=0.04)
+    np.testing.assert_allclose(np.bincount(s2[s1 == 3])[3:] / (s1 == 3).sum(), [0.5] * 2, atol=0.04)
+
+
 def test_no_clip_is_contrasted_with_itself():
     others = derangements(4, 500, np.random.default_rng(0))
     assert others.shape == (500, 4) and (others != torch.arange(4)).all()

@@ -61,14 +61,17 @@ def draw_clips(
 ) -> Tensor:
     """Draw images s0 < s1 <= s2 of random trajectories: (size, 3, 64, 64, 3) uint8.
 
+    s1 is any image but the first, s0 any one before it, and s2 any one from it on.
+
     :param lengths: (N,), the number of actions of each trajectory, one less than its images
     :param images: returns the images of a trajectory, by its number, at some times
     """
     clips = []
     for i in rng.integers(len(lengths), size=size):
         end = int(lengths[i]) + 1
-        first = int(rng.integers(end - 1))
-        second = int(rng.integers(first + 1, end))
+        # s1 first, as in the published code: with s0 first, s1 and s2 would crowd at the end.
+        second = int(rng.integers(1, end))
+        first = int(rng.integers(second))
         clips.append(images(int(i), [first, second, int(rng.integers(second, end))]))
     return torch.from_numpy(np.stack(clips))
 

@@ -194,7 +194,8 @@ class RLPDLearner:
     def _update_actor(self, embed: Tensor, generator: Generator | None) -> dict[str, Tensor]:
         """Actor and temperature on the encoder's output, which they do not train.
 
-        RLPD encodes the images again after the critic's step; here h is of before, as in DrQ-v2.
+        The published critics encode the images again after their step, and the actor does not; here
+        h is of before for both, as in DrQ-v2.
         """
         policy = self.policy
         alpha = policy.log_alpha.exp().detach()

@@ -130,6 +130,7 @@ def draw_transitions(
     """Draw transitions whose n steps lie inside one episode, every start equally likely.
 
     Before an episode's third image its first one stands for those that are missing, as in acting.
+    A part of a long episode is drawn from like an episode, though in acting its images go on.
     Episodes shorter than n steps are drawn whole. DrQ-v2 draws an episode and then a start in it,
     which is the same where all episodes are equally long.
 

@@ -1,6 +1,6 @@
 """Small wrappers, each named by a verb: CheckAction, RepeatAction, PadAction, SeePixels."""
 
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -17,14 +17,15 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
         gym.ActionWrapper.__init__(self, env)
 
     def action(self, action: np.ndarray) -> np.ndarray:
-        """Return the same action as float32.
+        """Return the same action in the dtype of the Box; whole numbers are rounded.
 
         :param action: (A,)
         :raises ValueError: if the action is invalid
         """
-        action = np.asarray(action, np.float32)
         box = self.action_space
         assert isinstance(box, spaces.Box), box
+        whole = np.issubdtype(box.dtype, np.integer)
+        action = np.asarray(action, np.float64 if whole else box.dtype)
         if action.shape != box.shape:
             raise ValueError(f"The action has the shape {action.shape}, but it must be {box.shape}")
         if not np.isfinite(action).all():
@@ -34,7 +35,7 @@ class CheckAction(gym.ActionWrapper, RecordConstructorArgs):
                 f"The action {action} lies outside [{box.low.min()}, {box.high.max()}]: "
                 "`action = numpy.clip(action, env.action_space.low, env.action_space.high)`"
             )
-        return action
+        return np.rint(action).astype(box.dtype) if whole else action
 
 
 class PadAction(gym.ActionWrapper, RecordConstructorArgs):
@@ -53,9 +54,10 @@ class PadAction(gym.ActionWrapper, RecordConstructorArgs):
                 f"pass {width} or more, or None"
             )
         self._width = width
-        pad = np.ones(size - width, np.float32)
-        low, high = np.concatenate([box.low, -pad]), np.concatenate([box.high, pad])
-        self.action_space = spaces.Box(low, high, dtype=np.float32)
+        pad = np.ones(size - width, box.dtype)
+        lowest = 0 * pad if np.issubdtype(box.dtype, np.unsignedinteger) else -pad
+        low, high = np.concatenate([box.low, lowest]), np.concatenate([box.high, pad])
+        self.action_space = spaces.Box(low, high, dtype=box.dtype.type)
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the entries that the environment has."""
@@ -135,7 +137,7 @@ class SeePixels(gym.Wrapper, RecordConstructorArgs):
 
     def _seen(self, state: Any, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         if self._state_in_info:
-            info = info | {"state": state}
+            info = info | {"state": deepcopy(state)}  # the environment may write into it later
         self._image = self.get_wrapper_attr("look")(self._image_size)
         return self._image.copy(), info
 

@@ -39,10 +39,9 @@ class Count(gym.Env):
     render_mode = "rgb_array"
     observation_space = spaces.Box(0, 9, (1,), np.float32)
 
-    def __init__(self, discrete=False):
-        box = spaces.Box(-1, 1, (2,), np.float32)
+    def __init__(self, space=None):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
-        self.action_space = spaces.Discrete(2) if discrete else box
+        self.action_space = space or spaces.Box(-1, 1, (2,), np.float32)
         self.count, self.actions, self.looks = 0, [], 0
 
     def reset(self, *, seed=None, options=None):
@@ -133,6 +132,46 @@ def test_a_bad_action_is_refused_and_the_environment_goes_on(action, complaint):
     env.step(np.zeros(2))
 
 
+@pytest.mark.parametrize("pad_action_to", [None, 4])
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"), [(-0.1, 0.1, np.float64), (-5, 5, np.int32), (0, 255, np.uint8)]
+)
+def test_an_action_reaches_the_environment_in_the_dtype_of_its_own_space(
+    low, high, dtype, pad_action_to
+):
+    space = spaces.Box(low, high, (2,), dtype)
+    env = wpt_envs.pixels(Count(space), pad_action_to=pad_action_to)
+    env.reset()
+    for action in (env.action_space.low, env.action_space.high, env.action_space.sample()):
+        env.step(action)
+        assert space.contains(env.unwrapped.actions[-1])
+        assert np.array_equal(env.unwrapped.actions[-1], action[:2])
+
+
+def test_fractions_are_rounded_where_actions_are_whole_numbers():
+    env = CheckAction(Count(spaces.Box(-5, 5, (2,), np.int32)))
+    env.reset()
+    env.step(np.array([2.7, -2.7], np.float32))
+    assert env.unwrapped.actions[0].tolist() == [3, -3]
+
+
+class Overwriting(Count):
+    """Counts in the same array."""
+
+    state = np.zeros(1, np.float32)
+
+    def step(self, action):
+        self.state[:], *outcome = super().step(action)
+        return self.state, *outcome
+
+
+def test_the_state_in_info_stays_as_it_was():
+    env = wpt_envs.pixels(Overwriting(), state_in_info=True)
+    env.reset()
+    infos = [env.step(np.zeros(2))[-1] for _ in range(3)]
+    assert [float(info["state"][0]) for info in infos] == [1, 2, 3]
+
+
 def test_the_picture_is_taken_once_an_agent_step():
     env = wpt_envs.pixels(Count(), action_repeat=2)
     env.reset()
@@ -156,11 +195,11 @@ def test_changing_an_observation_changes_nothing_else():
 
 
 def test_discrete_actions_are_seen_and_repeated_but_not_padded():
-    env = wpt_envs.pixels(Count(discrete=True), action_repeat=2)
+    env = wpt_envs.pixels(Count(spaces.Discrete(2)), action_repeat=2)
     env.reset()
     assert env.step(1)[1] == 3.0
     with pytest.raises(ValueError, match="flat Box"):
-        wpt_envs.pixels(Count(discrete=True), pad_action_to=4)
+        wpt_envs.pixels(Count(spaces.Discrete(2)), pad_action_to=4)
 
 
 def test_an_environment_without_pictures_is_refused_with_the_remedy():

@@ -16,7 +16,7 @@ from wpt_agents.zoo.collect import collection as module
 from wpt_agents.zoo.collect.behaviours import COLOURS, coloured_noise, noise_actions
 from wpt_agents.zoo.collect.collection import collect
 from wpt_agents.zoo.collect.curious import Expedition, explore
-from wpt_agents.zoo.collect.episodes import Recipe, record
+from wpt_agents.zoo.collect.episodes import Recipe, make_env, record
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
 
 pytestmark = pytest.mark.slow  # it runs simulators or whole runs
@@ -108,6 +108,41 @@ def test_the_stored_actions_lead_to_the_stored_images(tmp_path):
 def test_one_task_needs_no_list(tmp_path):
     data = collect(tmp_path / "data", DOT, 1, workers=1, progress_bar=False)
     assert data.tasks == [DOT]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"),
+    [
+        ([0, -5], [10, 5], np.int32),
+        ([-0.3, 2.0], [0.7, 2.0], np.float32),  # the second is always 2
+        ([-0.1, 0.0], [0.2, 0.1], np.float64),
+    ],
+)
+def test_actions_stay_within_the_bounds_of_any_task(low, high, dtype):
+    space = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+    taken = []
+
+    class Bounded(ClockEnv):
+        def step(self, action):
+            assert self.action_space.contains(action), action
+            taken.append(action)
+            return super().step(action)
+
+    def make():
+        env = Bounded()
+        env.action_space = space
+        return env
+
+    gym.register("Bounded-v0", entry_point=make, disable_env_checker=True)
+    try:
+        env = make_env("Bounded-v0", Recipe())
+    finally:
+        del gym.registry["Bounded-v0"]
+    assert env.action_space == gym.spaces.Box(-1, 1, (2,), np.float32)
+    ends = np.array([[-1, 1], [1, -1], [0.1, 0.9]], np.float32)
+    record(env, lambda obs, info, t: ends[t % 3], seed=0)
+    assert np.array_equal(taken[0], [space.low[0], space.high[1]])
+    assert np.array_equal(taken[1], [space.high[0], space.low[1]])
 
 
 def test_tasks_of_discrete_actions_are_refused_with_the_line_that_converts_them(tmp_path):

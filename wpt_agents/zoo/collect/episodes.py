@@ -15,6 +15,7 @@ import wpt_envs
 from gymnasium import spaces
 
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.model.actions import to_bounds
 from wpt_agents.training.spaces import check_actions
 from wpt_agents.zoo.collect.behaviours import Act, noise_actions, random_actions, scripted_actions
 from wpt_agents.zoo.collect.policies import SavedPolicy, sees_states
@@ -105,9 +106,13 @@ def make_env(task: str, recipe: Recipe) -> gym.Env:
     keywords = {**recipe.env, "state_in_info": True} if needs_state else recipe.env
     env = gym.make(task, **keywords)
     check_actions(env.action_space, max_action_dim=None)
-    if env.action_space != spaces.Box(-1, 1, env.action_space.shape, np.float32):
-        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    return env
+    space = env.action_space
+    assert isinstance(space, spaces.Box), space
+    unit = spaces.Box(-1, 1, space.shape, np.float32)
+    if space == unit:
+        return env
+    # Gymnasium's RescaleAction divides by zero for whole numbers and for bounds that are equal.
+    return gym.wrappers.TransformAction(env, lambda action: to_bounds(action[None], space)[0], unit)
 
 
 def play_episode(env: gym.Env, job: Job, episode: int) -> Trajectory:

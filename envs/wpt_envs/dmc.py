@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import EzPickle
 
 from wpt_envs import tasks
 from wpt_envs.rendering import Camera, View  # before dm_control: it chooses the GL backend
@@ -102,6 +103,7 @@ class DMControl(Simulated):
         rescale_action: bool = False,
         floor: float | None = None,
     ) -> None:
+        EzPickle.__init__(self, task, rendering, camera, seed, render_mode, rescale_action, floor)
         self.dm_env = _load(task)
         super().__init__(task, seed, render_mode, fps=1 / self.dm_env.control_timestep())
         physics = self.dm_env.physics

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 
 from wpt_envs import tasks
 from wpt_envs.rendering import Camera, View  # before metaworld: it chooses the GL backend
@@ -85,6 +86,7 @@ class MetaWorld(Achieved):
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
+        EzPickle.__init__(self, task, rendering, camera, seed, render_mode)
         self.sawyer = _goal_observable(ALL_V3_ENVIRONMENTS[f"{task.name}-v3"]())
         super().__init__(task, seed, render_mode, fps=1 / self.sawyer.dt)
         self.view = View(self.sawyer.model, self.sawyer.data, rendering, camera, upright=True)

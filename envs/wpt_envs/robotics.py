@@ -7,6 +7,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 
 from wpt_envs import tasks
 from wpt_envs.rendering import Camera, View  # before gymnasium_robotics: it chooses the GL backend
@@ -104,6 +105,7 @@ class Robotics(Achieved):
         seed: int | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
+        EzPickle.__init__(self, task, rendering, camera, seed, render_mode)
         gym.register_envs(gymnasium_robotics)
         self.robot = cast(Any, gym.make(_IDS[task.name], disable_env_checker=True).unwrapped)
         super().__init__(task, seed, render_mode, fps=1 / self.robot.dt)

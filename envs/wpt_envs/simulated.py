@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import EzPickle
 
 from wpt_envs.rendering import View
 from wpt_envs.tasks import Task
@@ -11,10 +12,11 @@ from wpt_envs.tasks import Task
 StepResult = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
 
 
-class Simulated(gym.Env):
+class Simulated(gym.Env, EzPickle):
     """A task that observes the state and returns its image with `look`.
 
-    Subclasses define `reset` and `step`, and set `view`.
+    Subclasses define `reset` and `step`, set `view`, and pass their arguments to `EzPickle`: a
+    simulator cannot be stored, so a pickled or copied task is made again and begins with `reset`.
 
     ## Arguments
     `gymnasium.make` takes these for every family:

@@ -232,6 +232,19 @@ def test_an_environment_is_made_again_from_its_spec():
         assert str(gym.make(cart.spec)) == str(cart)
 
 
+@pytest.mark.parametrize("name", SUITES)
+def test_a_pickled_environment_is_made_again_and_draws_its_own_simulation(name):
+    env = gym.make(f"wpt/{name}-v0", rendering="fast", action_repeat=3)
+    again = pickle.loads(pickle.dumps(env))
+    env.reset(seed=0)  # from now on a GL context is open
+    action = np.full(env.action_space.shape, 0.5, np.float32)
+    for copied in (again, pickle.loads(pickle.dumps(env))):
+        assert np.array_equal(env.reset(seed=3)[0], copied.reset(seed=3)[0])
+        assert np.array_equal(env.step(action)[0], copied.step(action)[0])
+        copied.close()
+    env.close()
+
+
 def test_rendering_answers_the_last_observation():
     env = SeePixels(wpt_envs.pixels(Count()).env, image_size=64)
     obs, _ = env.reset()

@@ -100,6 +100,31 @@ def test_options_of_a_reset_reach_the_environments_of_a_vector_once():
         env.reset()
 
 
+def test_an_attribute_of_a_vector_is_set_to_the_same_value_everywhere():
+    vector = SyncVectorEnv([ClockEnv, ClockEnv])
+    as_vec_env(vector).set_attr("target", [1, 2])
+    assert [env.unwrapped.target for env in vector.envs] == [[1, 2]] * 2
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_info_of_each_reset_of_a_vector_is_kept(mode):
+    class Counting(ClockEnv):
+        resets = 0
+
+        def reset(self, *, seed=None, options=None):
+            self.resets += 1
+            return super().reset(seed=seed)[0], {"resets": self.resets}
+
+    env = as_vec_env(SyncVectorEnv([lambda: Counting(2), lambda: Counting(3)], autoreset_mode=mode))
+    env.reset()
+    counts = []
+    for _ in range(4):
+        *_, infos = env.step(np.zeros((2, 2), np.float32))
+        counts.append([info["resets"] for info in env.unwrapped.reset_infos])
+        assert not any("resets" in info for info in infos)
+    assert counts == [[1, 1], [2, 1], [2, 2], [3, 2]]
+
+
 def test_a_vector_whose_reset_takes_no_options_is_not_handed_any():
     class Plain(SyncVectorEnv):
         def reset(self, *, seed=None):

@@ -63,8 +63,10 @@ class GymnasiumVecEnv(VecEnv):
         infos = [_of_one(vector_infos, i) for i in range(self.num_envs)]
         for i in np.flatnonzero(dones):
             if self.mode == AutoresetMode.SAME_STEP:
-                last = infos[i].get("final_obs")  # if it is missing, the agent says so
-                infos[i] = {**infos[i].get("final_info", {}), "terminal_observation": last}
+                last = infos[i].pop("final_obs", None)  # if it is missing, the agent says so
+                final = infos[i].pop("final_info", {})
+                self.reset_infos[i] = infos[i]  # what remains is of the reset
+                infos[i] = {**final, "terminal_observation": last}
             else:
                 infos[i]["terminal_observation"] = _at(obs, i)
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
@@ -96,7 +98,9 @@ class GymnasiumVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all environments; Gymnasium cannot do so for some."""
         self._all_of(indices, "set_attr")
-        self.vector.unwrapped.set_attr(attr_name, value)  # type: ignore[attr-defined]
+        # Gymnasium would distribute the entries of a list or tuple among the environments.
+        values = [value] * self.num_envs
+        self.vector.unwrapped.set_attr(attr_name, values)  # type: ignore[attr-defined]
 
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any

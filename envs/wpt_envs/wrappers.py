@@ -72,7 +72,7 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if times < 1 or times != int(times):
             raise ValueError(f"action_repeat={times}: pass a whole number, 1 or more")
-        self._times = times
+        self._times = int(times)
         self.metadata = dict(env.metadata)
         if "render_fps" in env.metadata:
             self.metadata["render_fps"] = env.metadata["render_fps"] / times

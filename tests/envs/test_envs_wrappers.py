@@ -99,6 +99,12 @@ def test_every_repeat_gets_the_agents_action():
     assert action.tolist() == [1, 1]
 
 
+def test_a_whole_number_of_repeats_may_be_a_float():
+    env = RepeatAction(Count(), times=2.0)
+    env.reset()
+    assert env.step(np.zeros(2))[1] == 3.0
+
+
 @pytest.mark.parametrize("times", [0, -2, 1.5])
 def test_repeating_less_than_once_or_in_part_is_refused(times):
     with pytest.raises(ValueError, match="whole number, 1 or more"):

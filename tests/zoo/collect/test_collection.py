@@ -363,6 +363,16 @@ def test_a_policy_of_sb3_that_takes_states_is_shown_states_and_rescaled(tmp_path
         SavedPolicy(np.random.default_rng(0), name, 0.0, 6)
 
 
+@pytest.mark.filterwarnings("ignore:.*maximum and minimum values are equal")
+def test_a_saved_policy_of_an_action_that_is_fixed_collects_numbers(tmp_path):
+    env = ClockEnv()
+    env.action_space = gym.spaces.Box(np.float32([2, -1]), np.float32([2, 1]))
+    agent(env).save(tmp_path / "fixed.zip")
+    act = SavedPolicy(np.random.default_rng(0), str(tmp_path / "fixed.zip"), 0.1, 2)
+    taken = [act(env.reset()[0], {}, step) for step in range(2)]
+    assert np.isfinite(taken).all() and np.abs(taken).max() <= 1
+
+
 class StateEnv(gym.Env):
     observation_space = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
 

@@ -22,7 +22,7 @@ from zoo_command import call
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.actor_critic import lambda_return
 from wpt_agents.zoo.judge.diagnosis import Diagnosis, Promise, promises, show
-from wpt_agents.zoo.judge.evaluation import NoisyPolicy
+from wpt_agents.zoo.judge.evaluation import NoisyPolicy, episode_steps
 from wpt_agents.zoo.judge.trained import Origin, Trained, find_trained
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report.hub import card, pull, push
@@ -95,6 +95,13 @@ def test_eval_names_the_initial_states_where_a_policy_fails(moved, monkeypatch, 
     monkeypatch.setattr(Trained, "evaluate", lambda *_: score)
     assert call(monkeypatch, "eval", folder, "--episodes", "3", "--seed", "20") == 0
     assert "failures         seeds 20, 22 (" in capsys.readouterr().out
+
+
+def test_the_last_step_of_an_episode_may_repeat_an_action_less_often():
+    task = "wpt/dmc-walker-run-v0"  # of 1000 frames
+    assert [episode_steps(task, {"action_repeat": n}) for n in (1, 2, 3)] == [1000, 500, 334]
+    assert episode_steps(task, {}) == 500
+    assert episode_steps("CartPole-v1", {}) is None
 
 
 def test_noise_on_the_actions_is_of_the_asked_size_and_seeded():

@@ -93,7 +93,8 @@ class SavedPolicy:
         seen = np.asarray(info["state"], np.float32) if self.sees_states else obs
         start = np.array([step == 0])
         action, self.state = self.model.predict(seen, self.state, start, deterministic=True)
-        action = self.model.policy.scale_action(action)
+        with np.errstate(invalid="ignore"):  # 0 / 0 where both bounds of an action are equal
+            action = np.nan_to_num(self.model.policy.scale_action(action))
         noisy = np.clip(action + self.rng.normal(0, self.sigma, len(action)), -1, 1)
         self.state = executed(self.model, self.state, noisy)
         return noisy

@@ -1,5 +1,6 @@
 """Evaluate a policy: its returns over seeded episodes, and a video of one of them."""
 
+import math
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from typing import Any
@@ -28,7 +29,9 @@ PARALLEL = 50  # simulators at once in an evaluation, to bound the memory
 def episode_steps(task: str, env: Mapping[str, Any]) -> int | None:
     """Return the number of `env.step` calls in an episode of the task, None if unknown."""
     row = wpt_envs.TASKS.get(task)
-    return row.frames // env.get("action_repeat", row.action_repeat) if row else None
+    if row is None:
+        return None
+    return math.ceil(row.frames / env.get("action_repeat", row.action_repeat))
 
 
 def evaluate(

@@ -190,6 +190,12 @@ class _LookDrawn(gym.Wrapper, RecordConstructorArgs):
             self._view, self._model = View(model, data, self._rendering, camera), model
         return self._view
 
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; the environment may have made a new simulation for it."""
+        observation, info = self.env.reset(**kwargs)
+        self._simulation = find_simulation(self.env.unwrapped) or self._simulation
+        return observation, info
+
     def look(self, size: int) -> np.ndarray:
         """Return the current image, (size, size, 3) uint8."""
         return self._open().look(size)

@@ -66,11 +66,15 @@ def test_what_holds_no_simulation_is_refused_with_the_way_out():
         wpt_envs.pixels(env, rendering="near")
 
 
-def test_a_model_that_is_made_anew_is_drawn_anew():
+@pytest.mark.parametrize("holder", ["the same", "a new one"])
+def test_a_model_that_is_made_anew_is_drawn_anew(holder):
     env = Own(sim=raw(size=1))
     seen = wpt_envs.pixels(env, rendering="fast", camera="above")
     small, _ = seen.reset()
-    env.sim.__dict__ |= vars(raw(size=6))
+    if holder == "the same":
+        env.sim.__dict__ |= vars(raw(size=6))
+    else:  # as in robosuite, and in dm_control's composer
+        env.sim = raw(size=6)
     large, _ = seen.reset()
     reds = [int(((i[..., 0] > 80) & (i[..., 1] < 60)).sum()) for i in (small, large)]
     assert 0 < 4 * reds[0] < reds[1]

@@ -191,9 +191,11 @@ class _LookDrawn(gym.Wrapper, RecordConstructorArgs):
         return self._view
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; the environment may have made a new simulation for it."""
+        """Start an episode, for which the environment may have made a simulation or a terrain."""
         observation, info = self.env.reset(**kwargs)
         self._simulation = find_simulation(self.env.unwrapped) or self._simulation
+        if self._view is not None:
+            self._view.upload_terrain()
         return observation, info
 
     def look(self, size: int) -> np.ndarray:

@@ -81,6 +81,29 @@ def test_a_model_that_is_made_anew_is_drawn_anew(holder):
     seen.close()
 
 
+TERRAIN = """<mujoco><asset><hfield name="hills" nrow="9" ncol="9" size="1 1 1 .1"/></asset>
+<worldbody><light pos="0 0 3"/><geom type="hfield" hfield="hills"/></worldbody></mujoco>"""
+
+
+class Hills(Own):
+    """A new terrain in each episode, in the same simulation."""
+
+    def reset(self, *, seed=None, options=None):
+        self.model.hfield_data[:] = np.random.default_rng(seed).random(81)
+        return super().reset(seed=seed)
+
+
+def test_a_new_terrain_is_drawn():
+    model = mujoco.MjModel.from_xml_string(TERRAIN)
+    env = Hills(model=model, data=mujoco.MjData(model))
+    mujoco.mj_forward(model, env.data)
+    seen = wpt_envs.pixels(env, rendering="fast")
+    first, second, again = (seen.reset(seed=seed)[0] for seed in (1, 2, 1))
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, again)
+    seen.close()
+
+
 @pytest.mark.parametrize(
     "name", ["Ant-v5", "Hopper-v5", "Pusher-v5", "Reacher-v5", "InvertedPendulum-v5"]
 )

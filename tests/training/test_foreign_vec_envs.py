@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 
+import numpy as np
 import pytest
 from clock_episodes import all_on_time, learnt, stored
 from debug_agent import ClockEnv, agent, noise
@@ -76,6 +77,41 @@ def test_a_vecenv_without_the_last_image_is_refused_by_name_and_nothing_is_store
 )
 def test_an_environment_that_draws_into_one_array_keeps_its_last_images(wrap):
     assert all_on_time(learnt(wrap()), 6)
+
+
+class OneArray(VecEnvWrapper):
+    """Returns the observations of every reset and step in the same array."""
+
+    array = None
+
+    def _written(self, obs):
+        self.array = obs.copy() if self.array is None else self.array
+        self.array[:] = obs
+        return self.array
+
+    def reset(self):
+        return self._written(self.venv.reset())
+
+    def step_wait(self):
+        obs, *outcome = self.venv.step_wait()
+        return self._written(obs), *outcome
+
+
+def test_first_images_of_a_vecenv_with_one_array_are_kept():
+    class Later(ClockEnv):
+        resets = 0
+
+        def render(self):
+            return super().render() + np.uint8(10 * self.resets)
+
+        def reset(self, **kwargs):
+            self.resets += 1
+            return super().reset(**kwargs)
+
+    model = agent(OneArray(DummyVecEnv([Later])))
+    model.begin_episodes()
+    assert model.first_images(3)[:, 0, 0, 0].tolist() == [10, 20, 30]
+    assert all_on_time(learnt(OneArray(DummyVecEnv([ClockEnv]))), 6)
 
 
 class Quiet(DummyVecEnv):

@@ -227,14 +227,14 @@ class PixelAgent(SavedAgent):
         One is that of the first environment's open episode. For more, all environments are reset
         as often as it takes; in the middle of episodes, which a reset would cut, there is only one.
         """
-        image: np.ndarray = np.asarray(to_images(self._last_obs)[0])
+        image: np.ndarray = np.array(to_images(self._last_obs)[0])  # copies: VecEnvs may reuse it
         if self.rollout is not None and not self._last_episode_starts.all():
             opening = self.rollout.first_image(0)
             return image[:1] if opening is None else opening[None]
         images = [image]
         while number > len(images) * self.n_envs:
             self.begin_episodes()
-            images.append(np.asarray(to_images(self._last_obs)[0]))
+            images.append(np.array(to_images(self._last_obs)[0]))
         together: np.ndarray = np.concatenate(images)
         return together[:number]
 

@@ -102,8 +102,18 @@ def test_options_of_a_reset_reach_the_environments_of_a_vector_once():
 
 def test_an_attribute_of_a_vector_is_set_to_the_same_value_everywhere():
     vector = SyncVectorEnv([ClockEnv, ClockEnv])
-    as_vec_env(vector).set_attr("target", [1, 2])
-    assert [env.unwrapped.target for env in vector.envs] == [[1, 2]] * 2
+    env = as_vec_env(vector)
+    env.set_attr("target", [1, 2])
+    assert env.get_attr("target") == [env.unwrapped.target for env in vector.envs] == [[1, 2]] * 2
+
+
+def test_a_method_of_a_vector_is_returned_and_not_called():
+    vector = SyncVectorEnv([ClockEnv, ClockEnv])
+    env = as_vec_env(vector)
+    env.reset()
+    env.step(np.zeros((2, 2), np.float32))
+    assert env.has_attr("reset") and callable(env.get_attr("reset", indices=[1])[0])
+    assert [env.unwrapped.time for env in vector.envs] == [1, 1]
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)

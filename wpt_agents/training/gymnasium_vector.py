@@ -89,8 +89,10 @@ class GymnasiumVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment, or of the vector if it has no environments."""
         inner = self.vector.unwrapped
-        if isinstance(inner, SyncVectorEnv | AsyncVectorEnv):
-            values: Sequence[Any] = inner.get_attr(attr_name)
+        if isinstance(inner, SyncVectorEnv):  # its own get_attr would call functions
+            values: Sequence[Any] = [env.get_wrapper_attr(attr_name) for env in inner.envs]
+        elif isinstance(inner, AsyncVectorEnv):
+            values = inner.get_attr(attr_name)
         else:
             values = [getattr(self.vector, attr_name)] * self.num_envs
         return [values[i] for i in self._get_indices(indices)]

@@ -172,6 +172,13 @@ def test_the_wrapper_that_spoils_the_images_is_named(wrap, words):
     assert shown(learnt(ClockEnv())) == CLOCK  # it was left out
 
 
+@pytest.mark.parametrize("wrap", [lambda env: env, VecTransposeImage])
+def test_four_grayscale_images_are_not_taken_for_one_with_transparency(wrap):
+    env = DummyVecEnv([lambda: Seen(lambda i: i[..., :1], box(0, 255, (64, 64, 1), np.uint8))])
+    with pytest.raises(ValueError, match="VecFrameStack makes this of the images; leave it out"):
+        agent(wrap(VecFrameStack(env, 4)))
+
+
 def test_normalised_rewards_are_taken_once_the_images_are_left_alone():
     env = VecNormalize(DummyVecEnv([ClockEnv]), norm_obs=False)
     assert shown(learnt(env)) == CLOCK

@@ -51,6 +51,8 @@ def check_observations(env: VecEnv) -> None:
         culprit = _culprit(env, 3)
         if culprit:
             raise ValueError(f"The agent sees in colour, but observations are {space}: {culprit}")
+        if shape[axis] == 4 and (culprit := _culprit(env, 1)):  # four grayscale images, not RGBA
+            raise ValueError(f"The agent sees one image, but observations are {space}: {culprit}")
         how = {1: "repeated to three channels", 4: "taken without their transparency"}[shape[axis]]
         warnings.warn(f"{CHANNELS[shape[axis]]} observations, {shape}, are {how}", stacklevel=4)
     height, width = (shape[0], shape[1]) if axis == 2 else (shape[1], shape[2])

@@ -132,6 +132,16 @@ def test_after_an_evaluation_on_a_foreign_vecenv_new_episodes_begin(wrap):
     assert all_on_time(model, 2)
 
 
+def test_attributes_of_the_environments_in_a_dummyvecenv_stay_where_they_were():
+    env = DummyVecEnv([ClockEnv])
+    agent(env)
+    env.envs[0].length = 5
+    assert env.envs[0].length == env.envs[0].unwrapped.length == env.get_attr("length")[0] == 5
+    assert deepcopy(env.envs[0]).length == 5
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = env.envs[0].nothing
+
+
 def test_a_copy_of_a_vecenv_is_counted_by_itself():
     env = DummyVecEnv([ClockEnv])
     assert resets(env) == 0

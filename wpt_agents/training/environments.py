@@ -167,6 +167,12 @@ class OwnObservation(gym.ObservationWrapper):
         else:
             self.env.set_wrapper_attr(name, value)
 
+    def __getattr__(self, name: str) -> Any:
+        """Find it where it is defined, as code that made a DummyVecEnv looks into its `envs`."""
+        if name == "env" or name.startswith("__"):  # not there yet while a copy is made
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(self.env, name)
+
     def observation(self, observation: Any) -> Any:
         """Return a copy."""
         if isinstance(self.observation_space, spaces.Dict):

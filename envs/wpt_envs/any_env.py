@@ -193,7 +193,9 @@ class _LookDrawn(gym.Wrapper, RecordConstructorArgs):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode, for which the environment may have made a simulation or a terrain."""
         observation, info = self.env.reset(**kwargs)
-        self._simulation = find_simulation(self.env.unwrapped) or self._simulation
+        simulation = find_simulation(self.env.unwrapped)
+        if simulation is not None:
+            self._simulation = simulation
         if self._view is not None:
             self._view.upload_terrain()
         return observation, info

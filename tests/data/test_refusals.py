@@ -114,6 +114,9 @@ IMAGES = {
     "signed": (np.full((2, 8, 8, 3), -1.0), r"from -1 to -1, not uint8 .*\(image - low\)"),
     "rgba": (np.zeros((2, 8, 8, 4), np.uint8), r"4 channels .*RGBA\? .*image\[\.\.\., :3\]"),
     "gray": (np.zeros((2, 8, 8, 1), np.uint8), r"1 channels .*np\.repeat\(image, 3, axis=-1\)"),
+    "rgba first": (np.zeros((2, 4, 8, 8), np.uint8), r"RGBA\? Drop .*image\[:, :3\]"),
+    "gray first": (np.zeros((2, 1, 8, 8), np.uint8), r"np\.repeat\(image, 3, axis=1\)"),
+    "gray and alpha first": (np.zeros((2, 2, 8, 8), np.uint8), r"image\[:, :1\], 3, axis=1\)"),
     "flat": (
         np.zeros((2, 8, 8), np.uint8),
         r"without a channel axis.*image\[\.\.\., None\]",
@@ -124,17 +127,21 @@ REMEDIES = {  # what the messages say, followed to the letter
     "float": lambda image: np.rint(255 * image).astype(np.uint8),
     "rgba": lambda image: image[..., :3],
     "gray": lambda image: np.repeat(image, 3, axis=-1),
+    "rgba first": lambda image: image[:, :3],
+    "gray first": lambda image: np.repeat(image, 3, axis=1),
+    "gray and alpha first": lambda image: np.repeat(image[:, :1], 3, axis=1),
     "flat": lambda image: np.repeat(image[..., None], 3, axis=-1),
 }
 
 
 @pytest.mark.parametrize("kind", IMAGES)
-def test_images_of_another_shape_or_range_are_refused_with_a_remedy_that_works(kind):
+def test_images_of_another_shape_or_range_are_refused_with_a_remedy_that_works(kind, recwarn):
     image, words = IMAGES[kind]
     with pytest.raises(ValueError, match=words):
         as_images(image, Resizer(8))
     if kind in REMEDIES:
         assert as_images(REMEDIES[kind](image), Resizer(8)).shape == (2, 8, 8, 3)
+        assert not recwarn  # none of resizing: the images are as large as before
 
 
 def test_floats_that_are_bytes_in_fact_are_taken():

@@ -235,12 +235,10 @@ def as_images(image: np.ndarray, resize: Resizer) -> np.ndarray:
             f"the observations are {image.shape} {image.dtype}, not (N, H, W, 3) uint8 images; "
             "name the images' key, image_key (--image-key), or render the states first"
         )
-    if image.shape[1] < min(
-        image.shape[2:]
-    ):  # the axis is smaller than the others, so it is the channel axis
-        image = image.transpose(0, 2, 3, 1)
-    _check_channels(image)
-    return resize(_as_bytes(image)[..., -3:])
+    # The axis that is smaller than the others is the channel axis.
+    axis = 1 if image.shape[1] < min(image.shape[2:]) else -1
+    _check_channels(image, axis)
+    return resize(np.moveaxis(_as_bytes(image), axis, -1)[..., -3:])
 
 
 def decoded(pictures: Iterable[bytes], resize: Resizer) -> np.ndarray:
@@ -260,15 +258,16 @@ def decoded(pictures: Iterable[bytes], resize: Resizer) -> np.ndarray:
     return np.concatenate(images)
 
 
-def _check_channels(image: np.ndarray) -> None:
-    channels = image.shape[-1]
+def _check_channels(image: np.ndarray, axis: int) -> None:
+    channels = image.shape[axis]
     if channels % 3 == 0:
         return
     problem = f"the images have {channels} channels ({image.shape}), colour needs 3"
+    first = "image[:, :{}]" if axis == 1 else "image[..., :{}]"
     remedies = {
-        1: "grayscale? Repeat it, np.repeat(image, 3, axis=-1)",
-        2: "grayscale with alpha? Take np.repeat(image[..., :1], 3, axis=-1)",
-        4: "RGBA? Drop the alpha channel, image[..., :3]",
+        1: f"grayscale? Repeat it, np.repeat(image, 3, axis={axis})",
+        2: f"grayscale with alpha? Take np.repeat({first.format(1)}, 3, axis={axis})",
+        4: f"RGBA? Drop the alpha channel, {first.format(3)}",
     }
     other = "the axes must be (N, H, W, 3) or (N, 3, H, W)"
     raise ValueError(f"{problem}: {remedies.get(channels, other)}")

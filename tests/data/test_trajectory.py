@@ -104,6 +104,8 @@ def test_stacked_windows_keep_to_the_chain():
         ({"action": ACTION[:, :0]}, r"must be \(T, A\) .* got \(3, 0\)"),
         ({"action": np.full((3, 2), np.nan)}, r"finite and in \[-1, 1\]"),
         ({"action": np.full((3, 2), 2.0)}, "rescale"),
+        ({"action": np.full((3, 2), -128, np.int8)}, "runs from -128 to -128: rescale"),
+        ({"action": np.full((3, 2), -(2**63))}, "rescale"),
         ({"reward": np.zeros((3, 1))}, "reward must be finite and of shape"),
         ({"reward": np.array([0, np.inf, 0])}, "pass None when rewards are unknown"),
         ({"action_dim": 3}, "exceeds the width 2"),

@@ -141,8 +141,9 @@ def check_range(action: np.ndarray) -> None:
             f"Trajectory.action must be finite and in [-1, 1], but action {t} is {action[t, i]} in "
             f"dimension {i}; leave that episode out"
         )
-    if np.abs(action).max() > 1 + TOLERANCE:
-        least, most = action.min(0), action.max(0)
+    # as floats: the int8 -128 has no absolute value in int8
+    least, most = action.min(0).astype(float), action.max(0).astype(float)
+    if max(-least.min(), most.max()) > 1 + TOLERANCE:
         i = int(np.argmax(np.maximum(-least, most)))
         low, high = (",".join(f"{x:.4g}" for x in row) for row in (least, most))
         raise ValueError(

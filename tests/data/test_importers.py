@@ -502,6 +502,14 @@ def test_discrete_actions_of_sb3_are_refused():
         SB3Episodes(SB3Buffer(5, image, gym.spaces.Discrete(2), "cpu"))
 
 
+def test_actions_of_sb3_with_several_axes_keep_their_bounds():
+    buffer = sb3_buffer([chain(5, 0)], 50)
+    low, high = np.array([[[-2], [0]], [[2], [1]]], np.float32)
+    buffer.action_space = gym.spaces.Box(low, high)
+    (episode,) = SB3Episodes(buffer, **SMALL)
+    assert episode.bounds.tolist() == [[-2, 0], [2, 1]]
+
+
 def test_a_ring_that_has_gone_round_is_read_oldest_first():
     old = [chain(6, 0), chain(7, 1, terminated=True), chain(4, 2)]
     new = list(SB3Episodes(sb3_buffer(old, 13), **SMALL))

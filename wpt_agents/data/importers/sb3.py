@@ -47,7 +47,8 @@ class SB3Episodes(Episodes):
         if not isinstance(buffer.action_space, spaces.Box):
             raise ValueError(f"The buffer's actions are {buffer.action_space}; they must be a Box")
         self._buffer = buffer
-        self._limits = buffer.action_space.low, buffer.action_space.high
+        # SB3 stores actions of several axes as one
+        self._limits = np.ravel(buffer.action_space.low), np.ravel(buffer.action_space.high)
         self._overwritten = bool(getattr(buffer, "optimize_memory_usage", False))
         first = buffer.pos if buffer.full else 0
         # from the oldest row: in a full ring it is the one to be overwritten next

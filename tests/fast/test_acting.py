@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from debug_agent import agent, noise
+from stable_baselines3.common.utils import polyak_update
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_env import LENGTH, DotEnv
 
@@ -114,6 +115,16 @@ def test_updates_and_loaded_and_replaced_weights_are_noticed():
         vector = policy.parameters_to_vector()
         policy.load_from_vector(vector + np.random.default_rng(seed).normal(0, 0.1, vector.shape))
         assert_defined(policy)
+
+
+def test_weights_that_are_written_behind_autograds_back_are_noticed():
+    policy, other = agent().policy, agent(seed=5).policy
+    before = acted(policy, 1)["action"]
+    polyak_update(other.actor.parameters(), policy.actor.parameters(), tau=0.5)  # of `weight.data`
+    assert (acted(policy, 1)["action"] != before).any()
+    assert_defined(policy)
+    policy.world_model.encoder.layers[0].weight.detach().numpy()[:] *= 2
+    assert_defined(policy)
 
 
 def test_images_may_lie_in_memory_as_they_like():

@@ -8,6 +8,8 @@ are cached here, and renewed only when weights have changed: between episodes, n
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from wpt_agents.fast.acting_networks import FastActor, FastEncoder, FastFilter
@@ -37,18 +39,22 @@ class FastStep:
         self.marks = self._marks(policy)
         # keep the current weights alive, so that no other weight gets the same address
         self.memory = [module[name].detach() for module, name in self.places]
+        self.samples = [last_entry(weight) for weight in self.memory]
+        self.values = [sample.tobytes() for sample in self.samples]
 
     def is_current(self, policy: WPTPolicy) -> bool:
         """Return whether the weights are unchanged since this was created."""
         same = all(a is b for a, b in zip(self.networks, networks_of(policy), strict=True))
-        return same and self.marks == self._marks(policy)
+        same = same and self.marks == self._marks(policy)
+        return same and self.values == [sample.tobytes() for sample in self.samples]
 
     def _marks(self, policy: WPTPolicy) -> tuple[int, list[tuple[int, int]]]:
         """Return the policy's count of updates, and each weight's address and version.
 
         The count detects updates by fused optimisers, which do not increase autograd's versions.
-        Addresses and versions detect all other changes: by `AveragedModel`, `polyak_update`,
-        `vector_to_parameters`, or by hand.
+        Addresses and versions detect the changes by `AveragedModel`, `vector_to_parameters`, and
+        by hand. What writes into `weight.data`, such as SB3's `polyak_update`, changes neither,
+        but it changes the values, of which `is_current` compares one of each weight.
         """
         weights = (module[name] for module, name in self.places)
         return policy.updates, [(weight.data_ptr(), weight._version) for weight in weights]
@@ -69,6 +75,13 @@ class FastStep:
             action = action * keep
         state = self.filter(state, action, self.encode(image), generator, sample)
         return state, self.outputs(state)
+
+
+def last_entry(weight: Tensor) -> np.ndarray:
+    """Return the bytes of a weight's last entry, in the memory of the weight."""
+    entry = weight[(slice(-1, None),) * weight.dim()].reshape(1)
+    array: np.ndarray = entry.view(torch.uint8).numpy()
+    return array
 
 
 # The fast step of each policy, for as long as the policy exists. It is not an attribute of the

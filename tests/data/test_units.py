@@ -80,6 +80,19 @@ def test_actions_beyond_the_limits_are_clipped_with_a_warning(tmp_path):
     assert dataset[0].action[0].tolist() == [1, -1]
 
 
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_an_action_that_is_not_finite_is_refused_where_others_are_clipped(tmp_path, bad):
+    action = np.array([[0, 0], [0.5, 3], [0.0, bad]])  # of which the first led to the first image
+    folder = tmp_path / "metaworld" / "reach"
+    folder.mkdir(parents=True)
+    image = np.zeros((3, 8, 8, 3), np.uint8)
+    np.savez(folder / "time-id-0-2.npz", observation=image, action=action)
+    for form, limits in (("npz", {"low": -4, "high": 4}), ("official", {})):
+        episodes = open_episodes(folder, form, image_size=8, **limits)
+        with pytest.raises(ValueError, match=r"action 1 is -?(inf|nan) in dimension 1; leave"):
+            episodes[0]
+
+
 def test_actions_outside_are_refused_with_the_range_and_the_remedy():
     action = np.array([[0.5, -3.25], [0.0, 2.5]], np.float32)
     words = r"dimension 1 runs from -3\.25 to 2\.5: .*low=\[0,-3\.25\], high=\[0\.5,2\.5\]"

@@ -135,12 +135,7 @@ def check_range(action: np.ndarray) -> None:
     :param action: (T, A)
     :raises ValueError: an action that is not finite, or is outside [-1, 1]
     """
-    if not np.isfinite(action).all():
-        t, i = np.argwhere(~np.isfinite(action))[0]
-        raise ValueError(
-            f"Trajectory.action must be finite and in [-1, 1], but action {t} is {action[t, i]} in "
-            f"dimension {i}; leave that episode out"
-        )
+    check_finite(action)
     # as floats: the int8 -128 has no absolute value in int8
     least, most = action.min(0).astype(float), action.max(0).astype(float)
     if max(-least.min(), most.max()) > 1 + TOLERANCE:
@@ -151,6 +146,20 @@ def check_range(action: np.ndarray) -> None:
             f"{most[i]:.4g}: rescale it, 2 * (action - low) / (high - low) - 1, by the low and "
             f"high of the environment's action space. An importer does that by low=[{low}], "
             f"high=[{high}], or wider (--low={low} --high={high})"
+        )
+
+
+def check_finite(action: np.ndarray) -> None:
+    """Refuse actions that are NaN or infinite.
+
+    :param action: (T, A)
+    :raises ValueError: names the first of them
+    """
+    if not np.isfinite(action).all():
+        t, i = np.argwhere(~np.isfinite(action))[0]
+        raise ValueError(
+            f"Trajectory.action must be finite and in [-1, 1], but action {t} is {action[t, i]} in "
+            f"dimension {i}; leave that episode out"
         )
 
 

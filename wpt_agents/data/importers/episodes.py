@@ -11,7 +11,7 @@ import numpy as np
 
 from wpt_agents.data.images import Resizer
 from wpt_agents.data.importers.keys import as_bytes, is_encoded
-from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory
+from wpt_agents.data.trajectory import IMAGE_SIZE, Trajectory, check_finite
 from wpt_agents.data.units import both_limits, rescaled
 
 
@@ -97,6 +97,7 @@ class Episodes(ABC):
             action = as_actions(action)
             limits = self._limits_of(action) or limits
             if limits is not None:
+                check_finite(action)  # infinity would be clipped to a limit
                 self._check_limits(action, *limits)
             return Trajectory(
                 image=as_images(image, self._resize),

@@ -41,7 +41,9 @@ class OfficialEpisodes(NpzEpisodes):
         return "episode" if int(named[1]) > 0 else "single"
 
     def _actions(self, arrays: dict[str, np.ndarray], taken: slice) -> np.ndarray:
-        return super()._actions(arrays, taken).clip(-1, 1)
+        actions = super()._actions(arrays, taken)
+        # NaN and infinity stay, and are refused
+        return np.where(np.isfinite(actions), actions.clip(-1, 1), actions)
 
     def _limits_of(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         ones = np.ones(action.shape[1])

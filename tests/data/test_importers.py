@@ -198,6 +198,15 @@ def start(seed=0):
     return Start(chain(1, seed).image[:1], none, none[:, 0], action_dim=2)
 
 
+def test_rewards_that_are_not_asked_for_need_not_be_one_for_each_step(tmp_path):
+    save_npz(tmp_path / "in/0.npz", chain(5))
+    with np.load(tmp_path / "in/0.npz") as arrays:
+        np.savez(tmp_path / "in/0.npz", **(dict(arrays) | {"reward": 3.0, "is_first": True}))
+    assert len(NpzEpisodes(tmp_path / "in", image_size=8)[0]) == 5
+    with pytest.raises(ValueError, match=r"0\.npz has 1 rewards for 6 actions"):
+        NpzEpisodes(tmp_path / "in", **SMALL)[0]
+
+
 def save_npz_folder(folder, trajectories):
     for i, trajectory in enumerate(trajectories):
         save_npz(folder / f"{i}.npz", trajectory)

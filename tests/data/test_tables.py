@@ -229,6 +229,14 @@ def save(path, arrays):
     return path
 
 
+def test_the_return_of_an_episode_is_no_reward_of_a_step(tmp_path):
+    arrays = rows([chain(5)]) | {"dones": last([chain(5)]), "reward": 3.0}
+    (episode,) = open_episodes(save(tmp_path / "in.hdf5", arrays), image_size=8)
+    assert len(episode) == 4
+    with pytest.raises(ValueError, match=r"in\.hdf5 rows 0 to 4: "):
+        open_episodes(tmp_path / "in.hdf5", image_size=8, rewards=True)[0]
+
+
 @pytest.mark.parametrize(
     "flags",
     [

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from wpt_agents.data.importers.episodes import Episodes, warn_left_out
-from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, first, natural
+from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, count, first, natural
 from wpt_agents.data.importers.rows import between_images
 from wpt_agents.data.importers.tables import TableEpisodes
 from wpt_agents.data.trajectory import Trajectory
@@ -93,6 +93,8 @@ class NpzEpisodes(Episodes):
             return self._flat[i - len(self._files)]
         file = self._files[i]
         keys = {*self._image_keys, *self._action_keys, *OTHERS, *self._done_keys()}
+        if not self.rewards:
+            keys.discard("reward")
         arrays = arrays_of(file, keys)
         key = self._check(file, arrays)
         images = len(arrays[key])
@@ -109,7 +111,7 @@ class NpzEpisodes(Episodes):
             self._actions(arrays, taken),
             arrays["reward"][taken] if "reward" in arrays else None,
             source=file.relative_to(self._folder).as_posix(),
-            terminated=seen and bool(np.ravel(over)[-1] == 1),
+            terminated=seen and bool((np.ravel(over)[-1:] == 1).any()),
             **self._labels(file),
         )
 
@@ -141,7 +143,7 @@ class NpzEpisodes(Episodes):
                 f"{', '.join(map(repr, needed))} and one of {', '.join(self._image_keys)}; name "
                 "them by image_key and action_key (--image-key, --action-key)"
             )
-        images = len(arrays[key])
+        images = count(arrays[key])
         counts = {len(np.atleast_1d(arrays[name])) for name in self._action_keys}
         if counts not in ({images}, {images - 1}):
             raise ValueError(
@@ -150,9 +152,9 @@ class NpzEpisodes(Episodes):
                 "there is one action fewer"
             )
         rewards = len(np.atleast_1d(arrays.get("reward", ())))
-        if self.rewards and "reward" in arrays and {rewards} != counts:
+        if "reward" in arrays and {rewards} != counts:
             raise ValueError(f"{file} has {rewards} rewards for {max(counts)} actions")
-        if arrays.get("is_first", np.zeros(1))[1:].any():
+        if np.ravel(arrays.get("is_first", 0))[1:].any():
             raise ValueError(
                 f"{file} holds parts of several episodes (is_first), as DreamerV3's chunks do; "
                 "write one file per episode"

@@ -69,7 +69,7 @@ class RldsEpisodes(Episodes):
             opened.seek(at)
             steps = read_steps(opened.read(size), source)
         image = self._images(steps, source)
-        reward = steps.get("reward")
+        reward = steps.get("reward") if self.rewards else None
         over = self._find(steps, self.done_key or "is_terminal", source, [0])
         return self._trajectory(
             image,

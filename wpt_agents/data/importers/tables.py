@@ -4,7 +4,7 @@ import os
 import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,7 @@ class TableEpisodes(Episodes):
             )
         if groups:
             return self._find_groups(file, groups, task)
-        keys = find_keys(table, self.image_key, self.action_keys)
+        keys = self._keys(table, self.image_key, self.action_keys)
         self._say_camera(keys)
         flags = self.done_key is not None or first(ENDS, table) is not None
         flags = flags or len(rows.starts(table, count(table[keys.actions[0]]))) > 1
@@ -131,6 +131,11 @@ class TableEpisodes(Episodes):
         self._doubtful.append(cut.doubtful)
         return cut.left_out
 
+    def _keys(self, table: Table, *names: Any) -> Keys:
+        """Return the names of an episode's arrays; rewards that are not kept are not read."""
+        keys = find_keys(table, *names)
+        return keys if self.rewards else replace(keys, reward=None)
+
     def _find_groups(self, file: Path, groups: dict[str, Table], task: str | None) -> int:
         image_key = None if self.image_key is None else within(self.image_key, groups)
         action_keys = tuple(within(key, groups) for key in self.action_keys)
@@ -138,7 +143,7 @@ class TableEpisodes(Episodes):
         left_out = 0
         for group, table in groups.items():
             try:
-                keys = find_keys(table, image_key, action_keys, done_key)
+                keys = self._keys(table, image_key, action_keys, done_key)
             except ValueError as error:
                 raise ValueError(f"{file} in {group}: {error}") from error
             self._say_camera(keys)

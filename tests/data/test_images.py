@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from wpt_agents.data.images import Resizer, area_weights, middle_square, resized
 
@@ -31,6 +32,15 @@ def test_many_images_are_resized_as_one_by_one():
     images = np.random.default_rng(0).integers(0, 256, (130, 20, 12, 3)).astype(np.uint8)
     one_by_one = np.concatenate([resized(image[None], 8) for image in images])
     np.testing.assert_array_equal(resized(images, 8), one_by_one)
+
+
+def test_images_that_cannot_be_written_are_resized_without_a_warning():
+    images = np.frombuffer(bytes(range(192)), np.uint8).reshape(1, 8, 8, 3)  # as of a file
+    torch.set_warn_always(True)  # otherwise torch warns once in a process
+    try:
+        assert resized(images, 4).shape == (1, 4, 4, 3)
+    finally:
+        torch.set_warn_always(False)
 
 
 def test_the_middle_square_of_wide_and_of_high_images():

@@ -24,7 +24,9 @@ def resized(images: np.ndarray, size: int) -> np.ndarray:
     parts = [np.zeros((0, size, size, channels), np.uint8)]  # the answer to no images
     chunk = max(1, CHUNK * 256**2 // max(height * width, 256**2))  # fewer images if they are large
     for at in range(0, len(images), chunk):
-        pixels = torch.from_numpy(np.ascontiguousarray(images[at : at + chunk])).float()
+        # writable, because torch warns of read-only arrays, such as those of a file
+        piece = np.require(images[at : at + chunk], requirements=("C", "W"))
+        pixels = torch.from_numpy(piece).float()
         count = len(pixels)
         # The average over an area separates into one product for each axis.
         pixels = rows @ pixels.reshape(count, height, width * channels)

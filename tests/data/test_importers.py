@@ -403,6 +403,17 @@ def test_a_folder_of_npz_is_converted_once_and_anew_when_a_file_changes(tmp_path
     assert len(list(cache.iterdir())) == 2
 
 
+def test_data_in_linked_folders_are_read_and_converted_anew_when_they_change(tmp_path, cache):
+    save_npz(tmp_path / "in/here/0.npz", chain(5, 0, size=64))
+    save_npz(tmp_path / "elsewhere/1.npz", chain(7, 1, size=64))
+    (tmp_path / "in/there").symlink_to(tmp_path / "elsewhere")
+    dataset = TrajectoryDataset.of(tmp_path / "in")
+    assert dataset.lengths.tolist() == [5, 7]
+    assert dataset.sources == ["here/0.npz", "there/1.npz"]
+    save_npz(tmp_path / "elsewhere/2.npz", chain(9, 2, size=64))
+    assert TrajectoryDataset.of(tmp_path / "in").lengths.tolist() == [5, 7, 9]
+
+
 def test_a_cache_that_cannot_be_made_is_said_to_be_movable(tmp_path, monkeypatch):
     save_npz(tmp_path / "in/0.npz", chain(5, 0, size=64))
     (tmp_path / "file").touch()  # in the place of a folder, which root cannot write into either

@@ -31,6 +31,7 @@ from wpt_agents.data.index import CONVERT_LOCK
 from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.data.units import Ranges
+from wpt_agents.files.folders import files_below
 from wpt_agents.files.locks import locked
 
 # Increased when a reader begins to read a format differently, so that conversions by earlier
@@ -230,7 +231,7 @@ def cache_folder(source: Source) -> Path:
     It is in `$XDG_CACHE_HOME/wpt_agents`, or `~/.cache/wpt_agents`; its content may be deleted.
     """
     path = Path(source).resolve() if Path(source).exists() else local_minari(os.fspath(source))
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = sorted(p for p in files_below(path) if p.is_file()) if path.is_dir() else [path]
     digest = hashlib.sha256(os.fsencode(path) + b" %d" % READERS)
     for file in files:
         # Size and time instead of the content, which may be many gigabytes.

@@ -20,6 +20,7 @@ import numpy as np
 from wpt_agents.data.importers.episodes import needs
 from wpt_agents.data.importers.keys import Table, natural
 from wpt_agents.data.importers.tables import TableEpisodes
+from wpt_agents.files.folders import files_below
 
 SUFFIXES = (".hdf5", ".h5", ".he5", ".hdf")
 
@@ -38,7 +39,7 @@ class Hdf5Episodes(TableEpisodes):
     def _list(self, path: Path) -> Sequence[Path]:
         if not path.is_dir():
             return super()._list(path)
-        files = sorted((f for f in path.rglob("*") if f.suffix in SUFFIXES), key=natural)
+        files = sorted((f for f in files_below(path) if f.suffix in SUFFIXES), key=natural)
         if not files:
             raise ValueError(f"{path} holds no HDF5 file ({', '.join(SUFFIXES)})")
         return files

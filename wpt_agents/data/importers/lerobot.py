@@ -18,6 +18,7 @@ import numpy as np
 
 from wpt_agents.data.importers.episodes import Episodes, as_images, needs, warn_left_out
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.folders import files_below
 
 
 class LeRobotEpisodes(Episodes):
@@ -130,7 +131,7 @@ class LeRobotEpisodes(Episodes):
         """Return the rows about episodes in the tables of version 3."""
         prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
         rows = []
-        for file in sorted((meta / "episodes").rglob("*.parquet")):
+        for file in sorted(files_below(meta / "episodes", "*.parquet")):
             names = self._parquet.read_schema(file).names
             columns = [name for name in names if name.startswith(prefixes)]
             rows += self._parquet.read_table(file, columns=columns).to_pylist()

@@ -22,6 +22,7 @@ from wpt_agents.data.importers.keys import ACTIONS, ENDS, Table, count, first, n
 from wpt_agents.data.importers.rows import between_images
 from wpt_agents.data.importers.tables import TableEpisodes
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.folders import files_below
 
 # of ExORL and URLB, of Dreamer, of others
 IMAGE_KEYS = ("observation", "image", "pixels")
@@ -48,7 +49,7 @@ class NpzEpisodes(Episodes):
         self._folder = path.parent if path.is_file() else path
         self._image_keys = (self.image_key,) if self.image_key else IMAGE_KEYS
         self._action_keys = self.action_keys or ("action",)
-        files = [path] if path.is_file() else sorted(path.rglob("*.npz"))
+        files = [path] if path.is_file() else sorted(files_below(path, "*.npz"))
         if not files:
             raise ValueError(f"{folder} holds no .npz file")
         kinds = {file: self._kind(file) for file in files}
@@ -168,7 +169,7 @@ class FlatNpz(TableEpisodes):
     _archive: zipfile.ZipFile | None = None
 
     def _list(self, path: Path) -> list[Path]:
-        files = [path] if path.is_file() else sorted(path.rglob("*.npz"), key=natural)
+        files = [path] if path.is_file() else sorted(files_below(path, "*.npz"), key=natural)
         return [file for file in files if is_flat(file)]
 
     def _read(self, file: Path) -> Table:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from wpt_agents.data.importers.npz import NpzEpisodes
+from wpt_agents.files.folders import files_below
 
 DMC, METAWORLD = SUITES = ("dmcontrol", "metaworld")
 NAME = re.compile(r"[^-]+-[^-]+-\d+-(\d+)\.npz")  # time, id, number and length
@@ -65,7 +66,7 @@ def is_official(folder: str | os.PathLike[str]) -> bool:
 
 def holds_official(folder: Path) -> bool:
     """Return whether such a folder holds files that are named as the authors'."""
-    return is_official(folder) and any(NAME.fullmatch(f.name) for f in folder.rglob("*.npz"))
+    return is_official(folder) and any(NAME.fullmatch(f.name) for f in files_below(folder, "*.npz"))
 
 
 def _below_suite(folder: Path) -> list[str]:

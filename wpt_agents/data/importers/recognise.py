@@ -11,6 +11,7 @@ from wpt_agents.data.importers.keys import natural
 from wpt_agents.data.importers.minari import local_minari
 from wpt_agents.data.importers.npz import is_flat
 from wpt_agents.data.importers.official import holds_official
+from wpt_agents.files.folders import files_below
 
 IN_FOLDERS = (("*.tfrecord*", "rlds"), ("*.hdf5", "hdf5"), ("*.h5", "hdf5"), ("*.npz", "npz"))
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
@@ -52,7 +53,7 @@ def _folder_format(path: Path) -> str | None:
         return "official"
     counts: dict[str, int] = {}
     for pattern, form in IN_FOLDERS:
-        counts[form] = counts.get(form, 0) + len(list(path.rglob(pattern)))
+        counts[form] = counts.get(form, 0) + len(list(files_below(path, pattern)))
     there = [form for form, count in counts.items() if count]
     if not there:
         return None
@@ -175,12 +176,12 @@ def _folder(path: Path, formats: str) -> str:
         )
     if not names:
         return f"is empty; pass a folder with data ({formats})"
-    if next(path.rglob("*.pt"), None):
+    if next(files_below(path, "*.pt"), None):
         return (
             "is not a dataset: it holds .pt files of torch; if they are TD-MPC2's data with "
             f"images, convert them by `{IMPORT} tdmpc2 {path} DST`, with --trust if you trust them"
         )
-    if next(path.rglob("*.array_record*"), None):
+    if next(files_below(path, "*.array_record*"), None):
         return _array_record()
     there = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
     what = "pictures without actions, " if Path(names[0]).suffix.lower() in PICTURES else ""

@@ -17,6 +17,7 @@ from wpt_agents.data.importers.episodes import Episodes, decoded, warn_left_out
 from wpt_agents.data.importers.keys import ENCODED
 from wpt_agents.data.importers.records import find_records, read_steps
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.folders import files_below
 
 # The parts of a dictionary of actions, in the order in which Open X-Embodiment's users concatenate
 # them: translation, rotation and gripper. Flags that end an episode and motions of a wheeled base
@@ -47,7 +48,7 @@ class RldsEpisodes(Episodes):
         path = Path(folder)
         self._folder = path.parent if path.is_file() else path
         pattern = f"*-{split}.tfrecord*" if split else "*.tfrecord*"
-        files = [path] if path.is_file() else sorted(path.rglob(pattern))
+        files = [path] if path.is_file() else sorted(files_below(path, pattern))
         if path.is_dir():
             _warn_of_missing(files)
         records = [

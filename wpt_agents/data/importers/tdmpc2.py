@@ -17,6 +17,7 @@ from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.keys import ACTIONS, IMAGES, REWARDS, first, natural
 from wpt_agents.data.importers.rows import between_images
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.files.folders import files_below
 
 
 class TdMpc2Episodes(Episodes):
@@ -42,7 +43,7 @@ class TdMpc2Episodes(Episodes):
         path = Path(file)
         self._root = path
         self._trust = trust
-        files = [path] if path.is_file() else sorted(path.rglob("*.pt"), key=natural)
+        files = [path] if path.is_file() else sorted(files_below(path, "*.pt"), key=natural)
         if not files:
             raise ValueError(f"{file} holds no .pt file")
         self._opened: tuple[Path, Mapping[str, Any]] | None = None

@@ -856,6 +856,33 @@ def test_a_table_of_lerobot_that_is_missing_is_named_and_can_be_skipped(tmp_path
     assert convert(skip=[1]).lengths.tolist() == [5]
 
 
+@pytest.mark.filterwarnings("ignore:LeRobot stored the images .* as video")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "data/chunk-000/file-000.parquet",
+        "videos/front/chunk-000/file-000.mp4",
+    ],
+)
+def test_a_file_of_lerobot_that_git_lfs_has_not_fetched_is_named(tmp_path, name):
+    save_lerobot(tmp_path, [6, 9])
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 1234\n"
+    (tmp_path / name).write_text(pointer)
+    with pytest.raises(ValueError, match=f"{name} (cannot be read|is damaged): "):
+        open_episodes(tmp_path, **SMALL)[0]
+
+
+def test_a_line_of_lerobot_may_contain_any_separator(tmp_path):
+    save_lerobot_2(tmp_path, [6, 9], video=False)
+    path = tmp_path / "meta/episodes.jsonl"
+    path.write_text(path.read_text().replace("task 0", "lift\u2028put\x85"), encoding="utf-8")
+    with pytest.warns(UserWarning, match="Images of 32 x 32 are resized"):
+        assert open_episodes(tmp_path, **SMALL)[0].task == "lift\u2028put\x85"
+
+
 def test_an_unknown_robot_of_lerobot_has_no_name(tmp_path):
     save_lerobot(tmp_path, [6], video=False)
     path = tmp_path / "meta/info.json"

@@ -6,6 +6,8 @@ Each is written in its program's own layout, from a known chain, and must come b
 import io
 import json
 import resource
+import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -693,6 +695,19 @@ def test_a_zarr_group_that_is_damaged_is_named(tmp_path):
     (tmp_path / "a.zarr" / "zarr.json").write_text("{")
     with pytest.raises(ValueError, match=r"a\.zarr cannot be read as a zarr group"):
         open_episodes(tmp_path / "a.zarr", "zarr")
+
+
+@pytest.mark.parametrize("array", ["img", "episode_ends"])
+def test_a_zip_of_a_zarr_group_that_is_damaged_is_named(tmp_path, array):
+    save_zarr(tmp_path / "a.zarr", [chain(5), chain(6)], version=3)
+    path = Path(shutil.make_archive(str(tmp_path / "a.zarr"), "zip", tmp_path / "a.zarr"))
+    with zipfile.ZipFile(path) as archive:
+        chunks = [i for i in archive.infolist() if f"/{array}/c/" in i.filename and i.file_size]
+    content = bytearray(path.read_bytes())
+    content[chunks[0].header_offset + 30 + len(chunks[0].filename) + 9] ^= 255
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.zarr\.zip.* cannot be read: "):
+        open_episodes(path, low=0, high=512, **SMALL)[0]
 
 
 # TD-MPC2: torch

@@ -10,7 +10,7 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ class LeRobotEpisodes(Episodes):
         self._refuse_done_key("LeRobot")
         self._parquet = needs("pyarrow.parquet", "LeRobot datasets")
         self._folder = Path(folder)
-        self._info = json.loads(_text(self._folder / "meta" / "info.json"))
+        self._info = _json(self._folder / "meta" / "info.json")
         version = str(self._info.get("codebase_version"))
         if not version.startswith(("v2.", "v3.")):
             raise ValueError(f"{folder} is of version {version}; convert it to v2.1 with lerobot")
@@ -93,7 +93,7 @@ class LeRobotEpisodes(Episodes):
         meta = self._folder / "meta"
         path = meta / "stats.json"
         if path.exists():
-            parts = [json.loads(_text(path))]
+            parts = [_json(path)]
         else:  # version 2.1 has those of each episode
             path = meta / "episodes_stats.jsonl"
             parts = [line["stats"] for line in _lines(path)] if path.exists() else []
@@ -132,10 +132,19 @@ class LeRobotEpisodes(Episodes):
         prefixes = ("episode_index", "tasks", "length", "data/", f"videos/{self._camera}/")
         rows = []
         for file in sorted(files_below(meta / "episodes", "*.parquet")):
-            names = self._parquet.read_schema(file).names
-            columns = [name for name in names if name.startswith(prefixes)]
-            rows += self._parquet.read_table(file, columns=columns).to_pylist()
+            rows += self._columns(file, lambda name: name.startswith(prefixes)).to_pylist()
         return rows
+
+    def _columns(self, path: Path, wanted: Callable[[str], bool]) -> Any:
+        """Return the columns of a parquet file whose names are wanted.
+
+        :raises ValueError: if the file cannot be read
+        """
+        try:
+            names = self._parquet.read_schema(path).names
+            return self._parquet.read_table(path, columns=[n for n in names if wanted(n)])
+        except (OSError, ValueError, NotImplementedError) as error:  # what pyarrow raises
+            raise ValueError(f"{path} cannot be read: {error}") from error
 
     def _file(self, row: dict[str, Any], kind: str, prefix: str) -> Path:
         """Return an episode's table or video.
@@ -188,12 +197,8 @@ class LeRobotEpisodes(Episodes):
         path = self._file(row, "data_path", "data/")
         if self._open is None or self._open[0] != path:
             usual = ("episode_index", "frame_index", "timestamp", "next.reward")
-            try:
-                names = self._parquet.read_schema(path).names
-                columns = [n for n in names if n in (*usual, *self._actions, self._camera)]
-                self._open = path, self._parquet.read_table(path, columns=columns)
-            except OSError as error:
-                raise ValueError(f"{path} cannot be read: {error}") from error
+            names = (*usual, *self._actions, self._camera)
+            self._open = path, self._columns(path, lambda name: name in names)
         table = self._open[1]
         # a file holds many episodes
         mine = np.flatnonzero(table["episode_index"].to_numpy() == row["episode_index"])
@@ -239,15 +244,26 @@ def _frames(path: Path, start: float, slack: float) -> Iterator[tuple[float, np.
             for frame in container.decode(stream):
                 if frame.time >= start - slack:
                     yield frame.time, frame.to_ndarray(format="rgb24")
-    except (OSError, av.FFmpegError) as error:
+    except (OSError, IndexError, av.FFmpegError) as error:  # IndexError: no stream of images
         raise ValueError(f"{path} cannot be read: {error}") from error
 
 
+def _json(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = _parsed(path, json.loads)
+    return content
+
+
 def _lines(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in _text(path).splitlines() if line.strip()]
+    lines: list[dict[str, Any]] = _parsed(
+        path, lambda text: [json.loads(line) for line in text.split("\n") if line.strip()]
+    )
+    return lines
 
 
-def _text(path: Path) -> str:
+def _parsed(path: Path, parse: Callable[[str], Any]) -> Any:
     if not path.exists():
         raise ValueError(f"{path} does not exist; is this a LeRobot dataset of version 2 or 3?")
-    return path.read_text(encoding="utf-8")
+    try:
+        return parse(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error

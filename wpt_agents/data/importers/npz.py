@@ -28,7 +28,7 @@ from wpt_agents.files.folders import files_below
 IMAGE_KEYS = ("observation", "image", "pixels")
 OTHERS = ("reward", "discount", "is_terminal", "is_first")
 # all exceptions that zipfile and NumPy raise for damaged files
-FAULTS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError)
+FAULTS = (zipfile.BadZipFile, zlib.error, RuntimeError, ValueError, EOFError, OSError, KeyError)
 
 
 class NpzEpisodes(Episodes):

@@ -2,6 +2,8 @@
 
 import os
 import warnings
+import zipfile
+import zlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +24,9 @@ from wpt_agents.data.importers.keys import (
     within,
 )
 from wpt_agents.data.trajectory import Trajectory
+
+# what h5py, zarr's codecs and zip archives raise for damaged files
+UNREADABLE = (OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,8 @@ class TableEpisodes(Episodes):
         for file in files:
             try:
                 left_out += self._find(file, several=len(files) > 1)
+            except UNREADABLE as error:
+                raise ValueError(f"{file} cannot be read: {error}{self.remedy}") from error
             except ValueError as error:
                 name = "" if str(error).startswith(str(file)) else f"{file}: "
                 raise ValueError(f"{name}{error}") from error
@@ -184,7 +191,7 @@ class TableEpisodes(Episodes):
                 episode = rows.episode(table, place.keys, *place.bounds, bool(place.shifted))
             pieces, action, reward, terminated = episode
             image = rows.read_images(pieces, lambda images: as_images(images, self._resize))
-        except (OSError, RuntimeError) as error:  # of h5py, and of zarr's codecs
+        except UNREADABLE as error:
             raise ValueError(f"{source} cannot be read: {error}{self.remedy}") from error
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from error

@@ -5,6 +5,7 @@ import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from io import FileIO
 
 import numpy as np
 import pytest
@@ -54,6 +55,19 @@ def test_a_trajectory_comes_back_as_it_was(tmp_path, codec, length):
     new = made(tmp_path, chain(3), old, codec=codec)[1]
     for name, value in vars(old).items():
         np.testing.assert_array_equal(getattr(new, name), value)
+
+
+def test_a_disk_may_read_less_than_it_is_asked_for(tmp_path, monkeypatch):
+    class Slow(FileIO):
+        def read(self, size=-1):
+            return super().read(min(size, 1000))
+
+    old = chain(70, size=8)
+    with TrajectoryDataset.create(tmp_path / "d", image_size=8, codec="raw") as dataset:
+        dataset.append(old)
+    monkeypatch.setattr(shards, "FileIO", Slow)
+    assert not dataset.validate()
+    np.testing.assert_array_equal(dataset[0].image, old.image)
 
 
 def test_single_images_are_those_of_the_trajectory(tmp_path):

@@ -40,7 +40,7 @@ def read_blocks(path: Path, entry: Entry, first: int, last: int) -> Iterator[mem
     with FileIO(path / name) as file:
         file.seek(entry.at + sum(sizes[:first]))
         # One read for all blocks, which are adjacent.
-        data = memoryview(file.read(sum(sizes[first : last + 1])))
+        data = memoryview(_read(file, sum(sizes[first : last + 1])))
     at, checksum = 0, 0
     for block in range(first, last + 1):
         stored = data[at : at + sizes[block]]
@@ -200,6 +200,14 @@ class Writer:
             file.close()
             raise
         return file
+
+
+def _read(file: FileIO, size: int) -> bytes:
+    data = file.read(size)
+    # Linux reads at most 2 GiB at once, and a network disk may read less.
+    while len(data) < size and (more := file.read(size - len(data))):
+        data += more
+    return data
 
 
 def _write(descriptor: int, data: bytes | memoryview) -> int:

@@ -137,11 +137,15 @@ def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path):
     done(started(fill_a_small_disk, tmp_path))
 
 
-def use_what_is_read_only(path):
+def make_read_only(path):
     mounts_of_its_own()
     where, bind, read_only = os.fsencode(path), 0x1000, 0x1000 | 0x20 | 0x1
     mount(where, where, None, bind)
     mount(None, where, None, read_only)
+
+
+def use_what_is_read_only(path):
+    make_read_only(path)
     dataset = TrajectoryDataset.open(path)
     check_chain(dataset.sample(4, 9))
     check_chain(next(dataset.batches(4, 9, 2, seed=0)))
@@ -154,6 +158,24 @@ def test_a_read_only_folder_is_read(tmp_path):
     with TrajectoryDataset.create(tmp_path, image_size=8) as dataset:
         dataset.append(chain(20))
     done(started(use_what_is_read_only, tmp_path))
+
+
+def use_a_cache_that_is_read_only(path):
+    make_read_only(path)
+    assert TrajectoryDataset.of(path / "in").lengths.tolist() == [20]
+    with pytest.raises(ValueError, match=r"which cannot be made .* set XDG_CACHE_HOME"):
+        TrajectoryDataset.of(path / "other")
+
+
+def test_a_finished_conversion_in_a_read_only_cache_is_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("in", "other"):
+        (tmp_path / name).mkdir()
+        old = chain(20, size=64)
+        action = np.concatenate([np.zeros((1, 2)), old.action])
+        np.savez(tmp_path / name / "0.npz", observation=old.image, action=action)
+    TrajectoryDataset.of(tmp_path / "in")
+    done(started(use_a_cache_that_is_read_only, tmp_path))
 
 
 def append_in_turns(path, seed):

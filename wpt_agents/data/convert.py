@@ -10,6 +10,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
@@ -152,16 +153,23 @@ def _open_path(source: Source) -> TrajectoryDataset:
     if form is None:
         raise refusal(source, NAMES)
     folder = cache_folder(source)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(
-            f"{source} is converted into a cache, which cannot be made ({error}): set "
-            "XDG_CACHE_HOME to a folder that can be written to, or convert first by "
-            f"`python -m wpt_agents.zoo import {form} {source} DST`"
-        ) from error
-    # Of several processes that start at once, one converts; the others wait and find it done.
-    with locked(folder / CONVERT_LOCK):
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # Of several processes that start at once, one converts; the others wait and find it
+            # done.
+            stack.enter_context(locked(folder / CONVERT_LOCK))
+        except OSError as error:
+            # A conversion that is there is used, also where nothing can be written.
+            missing = not (folder / "meta.json").exists()
+            if missing and error.errno is None:  # this system has no locks
+                raise
+            if missing:
+                raise ValueError(
+                    f"{source} is converted into a cache, which cannot be made ({error}): set "
+                    "XDG_CACHE_HOME to a folder that can be written to, or convert first by "
+                    f"`python -m wpt_agents.zoo import {form} {source} DST`"
+                ) from error
         return from_episodes(open_episodes(source, form), folder, progress_bar=True)
 
 

@@ -111,6 +111,7 @@ IMAGES = {
         np.full((2, 8, 8, 3), 0.5, np.float32),
         r"float32 from 0\.5 to 0\.5.*rint\(255 ",
     ),
+    "nan": (np.full((2, 8, 8, 3), np.nan), "hold NaN or infinity; leave that episode out"),
     "signed": (np.full((2, 8, 8, 3), -1.0), r"from -1 to -1, not uint8 .*\(image - low\)"),
     "rgba": (np.zeros((2, 8, 8, 4), np.uint8), r"4 channels .*RGBA\? .*image\[\.\.\., :3\]"),
     "gray": (np.zeros((2, 8, 8, 1), np.uint8), r"1 channels .*np\.repeat\(image, 3, axis=-1\)"),

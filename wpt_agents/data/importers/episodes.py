@@ -279,6 +279,8 @@ def _as_bytes(image: np.ndarray) -> np.ndarray:
     if image.dtype == np.uint8:
         return image
     least, most = float(image.min()), float(image.max())
+    if not np.isfinite([least, most]).all():
+        raise ValueError("the images hold NaN or infinity; leave that episode out")
     whole = image.dtype.kind in "fiu" and 0 <= least and (1 < most <= 255 or most == 0)
     if whole and np.array_equal(image, np.rint(image)):
         return image.astype(np.uint8)  # Diffusion Policy stores bytes as float32

@@ -3,6 +3,7 @@
 Such a file is an uncompressed zip archive; reading verifies the checksum of each member.
 """
 
+import errno
 import glob
 import json
 import os
@@ -66,11 +67,17 @@ def _alive(pid: str) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the directory entries of `folder` to disk, if the system supports it (not Windows)."""
+    """Sync the directory entries of `folder` to disk.
+
+    Nothing happens where that is not supported: on Windows, and on some network file systems.
+    """
     if hasattr(os, "O_DIRECTORY"):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(descriptor)
+        except OSError as error:
+            if error.errno not in (errno.EBADF, errno.EINVAL):
+                raise
         finally:
             os.close(descriptor)
 

@@ -67,6 +67,14 @@ def test_resizing_keeps_flat_colours_and_gradients():
     assert small[0, 0, :, 1].tolist()[-2:] == [100, 100]
 
 
+def test_the_advice_for_images_that_are_not_square_suits_any_layout(tmp_path):
+    image = np.zeros((3, 3, 20, 8), np.uint8)  # where image[..., 6:14, 0:8, :] is nothing
+    np.savez(tmp_path / "0.npz", observation=image, action=np.zeros((3, 2)))
+    with pytest.warns(UserWarning, match=r"to keep the proportions, pass crop=True \(--crop\)$"):
+        NpzEpisodes(tmp_path, **SMALL)[0]
+    assert NpzEpisodes(tmp_path, crop=True, **SMALL)[0].image.shape == (3, 8, 8, 3)
+
+
 @pytest.mark.parametrize(
     ("shape", "dtype", "culprit"),
     [((5, 17), np.float32, "render the states"), ((5, 8, 8, 1), np.uint8, "1 channels")],

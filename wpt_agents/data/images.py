@@ -65,7 +65,8 @@ def resize_message(
     """The sentence to say when images are resized, with a crop that keeps their proportions.
 
     :param crop_option: how to have the middle cut out, if the caller has an option for it
-    :param cut: the code that cuts the middle out; of channels-last images if None
+    :param cut: the code that cuts the middle out; of channels-last images if None, and if "" none,
+        because the images may be laid out differently
     """
     if height == width:
         return f"Images of {height} x {width} are resized to {size} x {size}"
@@ -73,10 +74,11 @@ def resize_message(
     if cut is None:
         cut = f"image[..., {rows.start}:{rows.stop}, {columns.start}:{columns.stop}, :]"
     ratio = max(height, width) / min(height, width)
+    ways = [f"cut the middle out first: {cut}"] if cut else []
+    ways += [crop_option] if crop_option else []
     return (
         f"Images of {height} x {width} are squeezed to {size} x {size}, which distorts shapes by a "
-        f"factor of {ratio:.2f}; to keep the proportions, cut the middle out first: {cut}"
-        + (f", or {crop_option}" if crop_option else "")
+        f"factor of {ratio:.2f}; to keep the proportions, {', or '.join(ways)}"
     )
 
 
@@ -86,10 +88,13 @@ class Resizer:
     :param size: height and width of the result
     :param crop: cut out the middle square instead of squeezing
     :param crop_option: how a user asks for `crop`, for the warning
+    :param cut: of `resize_message`
     """
 
-    def __init__(self, size: int, crop: bool = False, crop_option: str = "") -> None:
-        self.size, self.crop, self._crop_option = size, crop, crop_option
+    def __init__(
+        self, size: int, crop: bool = False, crop_option: str = "", cut: str | None = None
+    ) -> None:
+        self.size, self.crop, self._crop_option, self._cut = size, crop, crop_option, cut
         self._warned: set[tuple[int, int]] = set()
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
@@ -101,6 +106,6 @@ class Resizer:
             return np.ascontiguousarray(images)
         if (height, width) not in self._warned:
             self._warned.add((height, width))
-            message = resize_message(height, width, self.size, self._crop_option)
+            message = resize_message(height, width, self.size, self._crop_option, self._cut)
             warnings.warn(message, stacklevel=3)
         return resized(images, self.size)

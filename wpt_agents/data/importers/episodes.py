@@ -59,7 +59,7 @@ class Episodes(ABC):
         self.action_keys = as_keys(action_key)
         self.done_key = done_key
         self.limits = both_limits(low, high)
-        self._resize = Resizer(image_size, crop, "crop=True (--crop)")
+        self._resize = Resizer(image_size, crop, "pass crop=True (--crop)", cut="")
         self._warned_of_clipping = False
 
     @abstractmethod

@@ -181,6 +181,17 @@ def test_what_was_appended_is_seen_by_the_one_who_appended(tmp_path):
         assert len(dataset) == 3
 
 
+def test_what_others_appended_is_sampled_once_it_is_seen(tmp_path):
+    dataset = made(tmp_path, chain(20))
+    dataset.sample(2, 4)
+    with TrajectoryDataset.open(tmp_path) as other:
+        other.extend(chain(20, 1, reward=None) for _ in range(9))
+    with dataset:
+        dataset.reserve()
+    assert len(dataset) == 10
+    assert not dataset.sample(50, 4, rng=rng()).reward_known[:, 1:].all()
+
+
 @pytest.mark.parametrize("codec", ["zstd", "raw"])
 def test_extending_copies_another_dataset_in_its_order(tmp_path, codec):
     labels = {"terminated": True, "embodiment": "arm", "task": "reach", "source": "ours"}

@@ -249,6 +249,7 @@ class TrajectoryDataset(StoredTrajectories):
         if self._writer is None:
             self._writer = Writer(self.path, self._folders[0].meta)
             self._entries = self._writer.entries
+            self._windows = None
         return self._writer
 
     def flush(self) -> None:

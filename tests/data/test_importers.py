@@ -325,6 +325,22 @@ def test_a_conversion_that_was_cut_short_goes_on_where_it_stopped(tmp_path):
         check_same(trajectory, chain(5 + seed, seed))
 
 
+def test_a_conversion_that_another_one_overtakes_adds_nothing_twice(tmp_path, monkeypatch):
+    for i in range(3):
+        save_npz(tmp_path / "in" / f"{i}.npz", chain(5, i))
+    open_or_create = TrajectoryDataset.open_or_create
+
+    def overtaken(path, image_size):
+        monkeypatch.undo()
+        dataset = open_or_create(path, image_size)
+        TrajectoryDataset.from_npz(tmp_path / "in", path, **SMALL)
+        return dataset
+
+    monkeypatch.setattr(TrajectoryDataset, "open_or_create", overtaken)
+    dataset = TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", **SMALL)
+    assert dataset.sources == ["0.npz", "1.npz", "2.npz"]
+
+
 def test_a_conversion_killed_while_its_folder_is_made_goes_on(tmp_path):
     save_npz(tmp_path / "in/0.npz", chain(5))
     (tmp_path / "out").mkdir()

@@ -185,6 +185,27 @@ def from_episodes(
         be converted; those before it are kept
     """
     dataset = TrajectoryDataset.open_or_create(path, episodes.image_size)
+    ranges = Ranges()
+    with dataset:
+        done = _count_done(dataset, episodes, path)
+        if done < len(episodes):
+            dataset.reserve()  # another process may have converted some in between
+            done = _count_done(dataset, episodes, path)
+        with StageBar(len(episodes), "convert", progress_bar, done, " episodes") as bar:
+            for i in range(done, len(episodes)):
+                trajectory = _converted(episodes, i)
+                dataset.append(trajectory)
+                ranges.add(trajectory)
+                bar.update()
+    ranges.warn(episodes.name)
+    return dataset
+
+
+def _count_done(dataset: TrajectoryDataset, episodes: Episodes, path: Source) -> int:
+    """Return how many of the episodes are in the dataset already.
+
+    :raises ValueError: the dataset does not begin with these episodes
+    """
     done = dataset.appended
     known = done > 0 and len(dataset) == done  # otherwise the last one may be set aside
     if done > len(episodes) or (known and not _same(dataset, episodes[done - 1])):
@@ -192,16 +213,7 @@ def from_episodes(
             f"{path} holds {done} trajectories of another source or with other labels; "
             "convert to another folder"
         )
-    bar = StageBar(len(episodes), "convert", progress_bar, done, " episodes")
-    ranges = Ranges()
-    with dataset, bar:
-        for i in range(done, len(episodes)):
-            trajectory = _converted(episodes, i)
-            dataset.append(trajectory)
-            ranges.add(trajectory)
-            bar.update()
-    ranges.warn(episodes.name)
-    return dataset
+    return done
 
 
 def _converted(episodes: Episodes, i: int) -> Trajectory:

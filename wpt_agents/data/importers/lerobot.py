@@ -135,14 +135,14 @@ class LeRobotEpisodes(Episodes):
             rows += self._columns(file, lambda name: name.startswith(prefixes)).to_pylist()
         return rows
 
-    def _columns(self, path: Path, wanted: Callable[[str], bool]) -> Any:
-        """Return the columns of a parquet file whose names are wanted.
+    def _columns(self, path: Path, chooses: Callable[[str], bool]) -> Any:
+        """Return the columns of a parquet file that `chooses` picks by their names.
 
         :raises ValueError: if the file cannot be read
         """
         try:
             names = self._parquet.read_schema(path).names
-            return self._parquet.read_table(path, columns=[n for n in names if wanted(n)])
+            return self._parquet.read_table(path, columns=[n for n in names if chooses(n)])
         except (OSError, ValueError, NotImplementedError) as error:  # what pyarrow raises
             raise ValueError(f"{path} cannot be read: {error}") from error
 

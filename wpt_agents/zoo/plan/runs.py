@@ -16,7 +16,6 @@ from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.names import unknown_name
-from wpt_agents.training.guidance import ever, parse_schedule
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
 from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY
@@ -124,10 +123,10 @@ class Run:
         """True if the run needs trajectories of the task's robot from the dataset."""
         if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
             return self.algorithm.needs_data
-        wpt = SimpleNamespace(**self.full_keywords)
-        guided = ever(parse_schedule(wpt.guidance))
-        imitates = WPT.keywords(kickstart=wpt.kickstart).imitates
-        return bool(wpt.offline_ratio) or guided or imitates or wpt.ibrl or wpt.residual
+        values = self.full_keywords
+        names = ("guidance", "kickstart", "ibrl", "residual")
+        acting = Hyperparameters.of({name: values[name] for name in names})
+        return bool(values["offline_ratio"]) or acting.needs_clone
 
     @property
     def updates(self) -> int | None:

@@ -14,7 +14,6 @@ import numpy as np
 from wpt_agents.training.guidance import Schedule, parse_schedule
 
 RECENT = 5  # episodes whose mean return is compared
-TOLERANCE = 0.1  # of the prior actor's mean return, by which that of recent episodes may be lower
 FACTOR = 0.8  # of the weight after an episode
 
 
@@ -36,7 +35,7 @@ class Adaptive:
         """Return the weight after these episodes.
 
         Each of the later ones multiplies it by 0.8 if the mean of the five newest returns then
-        was at least the prior actor's mean, less a tenth of its size, and divides it by 0.8 if not.
+        was at least the prior actor's mean, and divides it by 0.8 if not.
 
         :param prior: returns of the episodes that the prior actor drove; the weight does not
             change without any
@@ -45,8 +44,7 @@ class Adaptive:
         weight = self.start
         if not len(prior):
             return weight
-        mean = float(np.mean(prior))
-        enough = mean - TOLERANCE * abs(mean)
+        enough = np.mean(prior)
         for number in range(1, len(later) + 1):
             recent = np.mean(later[max(number - RECENT, 0) : number])
             weight *= FACTOR if recent >= enough else 1 / FACTOR

@@ -316,7 +316,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Return the weight of the loss by which the actor imitates the prior actor."""
         if not self.progress.cloned:
             return 0.0
-        weight = self.hyperparameters.kickstart_at(self.num_timesteps, *self.collected_returns())
+        returns = self.collected_returns() if self.hyperparameters.adapts else ()
+        weight = self.hyperparameters.kickstart_at(self.num_timesteps, *returns)
         # In the head start it is the only term of the loss, so any weight will do.
         return max(weight, 1.0) if self.head_start else weight
 

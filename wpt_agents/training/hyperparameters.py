@@ -4,7 +4,6 @@ A new keyword is declared here and used in one other place. The signature of `WP
 its documentation, its checks and the zoo's list of what pre-training depends on follow from it.
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -395,7 +394,12 @@ class Hyperparameters(Keywords):
     @property
     def imitates(self) -> bool:
         """Whether the actor ever imitates the prior actor in its loss."""
-        return self.kickstart_at(0) > 0 or self.kickstart_at(sys.maxsize) > 0
+        return ever(self.kickstart_at)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether the weight of the imitation goes by the returns."""
+        return isinstance(parse_kickstart(self.kickstart), Adaptive)
 
     @property
     def needs_clone(self) -> bool:

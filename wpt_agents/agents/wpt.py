@@ -41,7 +41,7 @@ from wpt_agents.training.rollout import Window
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
     "model.prior stays None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, "
-    "kickstart=0 if this is intended"
+    "kickstart=0, without ibrl and residual, if this is intended"
 )
 
 
@@ -209,9 +209,11 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def _warn_without_dataset(self) -> None:
         """Warn if the missing dataset prevents cloning or rehearsal."""
-        if not self.progress.retrieved_ids:
+        settings = self.hyperparameters
+        lacks_clone = settings.needs_clone and not self.progress.cloned
+        if lacks_clone or not self.progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=4)
-        elif self.hyperparameters.offline_ratio:
+        elif settings.offline_ratio:
             what = "Without its dataset the model rehearses nothing: load it with dataset="
             warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=4)
 

@@ -269,28 +269,31 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def update(self, metrics: Metrics) -> None:
         """Make one update of every network on a mixed batch; append to `metrics`."""
-        settings = self.hyperparameters
         progress = self.progress
-        self.adapt_to_data(self.replay_buffer)
-        self.learn_ends()
-        self.fit_reward_ensemble()
-        head_start = self.head_start > 0
-        if settings.residual and progress.cloned and not head_start:
-            self.begin_residual()
-        if settings.actor_critic_decay:
-            left = 1 - progress.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
+        self.prepare_update()
         batch = self.mixed_batch()
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
+        weight = self.imitation_weight()
+        head_start = self.head_start > 0
         with self.operations():
-            update = self.learner.update(
-                batch, generator, progress.num_timesteps, self.imitation_weight(), head_start
-            )
+            update = self.learner.update(batch, generator, self.num_timesteps, weight, head_start)
         for name, value in update.items():
             metrics[name].append(value)
         self.policy.average(self.averaging())
         progress.updates += 1
         progress.task_updates += 1
+
+    def prepare_update(self) -> None:
+        """Adapt a new world model, add networks that are now needed, and set learning rates."""
+        settings = self.hyperparameters
+        self.adapt_to_data(self.replay_buffer)
+        self.learn_ends()
+        self.fit_reward_ensemble()
+        if settings.residual and self.progress.cloned and not self.head_start:
+            self.begin_residual()
+        if settings.actor_critic_decay:
+            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
 
     def mixed_batch(self) -> Batch:
         """Draw the batch of the next update: collected sequences, then retrieved ones."""
@@ -319,8 +322,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def collected_returns(self) -> tuple[list[float], list[float]]:
         """Return the returns of the collected trajectories, of the warm-up and of later ones.
 
-        With several environments it depends on the order in which episodes end which of those
-        around the end of the warm-up belong to it.
+        A trajectory is of the warm-up if fewer than `warmup_steps` steps are stored before it. Of
+        several environments, whose episodes are stored one after the other although they run at
+        the same time, this can be wrong for those that were open when the warm-up ended.
         """
         returns: tuple[list[float], list[float]] = ([], [])
         start = 0  # the number of steps before a trajectory

@@ -273,10 +273,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.prepare_update()
         batch = self.mixed_batch()
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
-        weight = self.imitation_weight()
-        head_start = self.head_start > 0
         with self.operations():
-            update = self.learner.update(batch, generator, self.num_timesteps, weight, head_start)
+            update = self.learner.update(
+                batch, generator, self.num_timesteps, self.imitation_weight(), self.head_start > 0
+            )
         for name, value in update.items():
             metrics[name].append(value)
         self.policy.average(self.averaging())
@@ -342,7 +342,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.learner.begin_imitator()
 
     def averaging(self) -> float:
-        """Return the share by which the average actor moves; it begins after the head start."""
+        """Return the share by which the average actor moves, 0 during the head start."""
         number = self.progress.task_updates - self.hyperparameters.actor_delay + 1
         share = self.hyperparameters.actor_average
         return debiased_fraction(share, number) if share and number > 0 else 0.0

@@ -1057,6 +1057,20 @@ def test_learning_without_a_dataset_is_said_once_unless_it_is_meant(store, recwa
     assert not [warning for warning in recwarn if "No dataset" in str(warning.message)]
 
 
+@pytest.mark.parametrize("keyword", ["ibrl", "residual"])
+def test_the_warning_of_no_dataset_names_every_keyword_that_needs_one(keyword):
+    with pytest.warns(UserWarning, match=f"No dataset: .*without .*{keyword}"):
+        agent(DotEnv(), offline_ratio=0, guidance=0, **{keyword: True}).learn(LENGTH)
+
+
+def test_a_prior_actor_that_was_not_finished_is_missed_without_the_dataset(store, tmp_path):
+    model = pretrained(store, env=DotEnv(), offline_ratio=0).learn(0)
+    model.progress.cloned = False  # as if the model was saved before the clone was finished
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="No dataset: .* no prior actor to guide"):
+        WPT.load(tmp_path / "model", env=DotEnv()).learn(LENGTH)
+
+
 def test_a_seed_that_was_set_is_saved(tmp_path):
     model = agent(DotEnv())
     model.set_random_seed(5)

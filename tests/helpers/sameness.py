@@ -84,6 +84,7 @@ def learnt(
         model = agent(**method)
     model.set_env(env or DotEnv())
     model.learn(60)
+    model._total_timesteps = 100  # rates that fall over `learn` would be 0 at its end
     return model, updated(model)
 
 

@@ -101,19 +101,11 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         super().prepare(progress_bar)
         if self.retrieved is None or self.progress.cloned:
             return
-        settings = self.hyperparameters
-        cloning = Cloning(
-            settings.value("bc_steps"),
-            settings.value("bc_batch_size"),
-            settings.bc_learning_rate,
-            settings.bc_shift,
-            settings.bc_variance,
-        )
         trained = clone(
             self.policy.prior_actor,
             self.retrieved.trajectories,
             self.policy.action_mask,
-            cloning,
+            Cloning.of(self.hyperparameters),
             self.streams,
             progress_bar,
         )

@@ -101,7 +101,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             self.learner.add_continue_head()
 
     def fit_reward_ensemble(self) -> None:
-        """Have as many reward heads as the keyword says; new ones know nothing yet."""
+        """Replace the further reward heads if `reward_ensemble` says another number of them."""
         model = self.policy.world_model
         number = self.hyperparameters.reward_ensemble - 1
         if len(model.reward_members) != number:
@@ -113,7 +113,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         return [self.streams.integer(Purpose.ENSEMBLE, k) for k in range(number)]
 
     def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
-        """Have the continue head and the further reward heads that these weights are of."""
+        """Add or remove continue head, further reward heads and imitator, as these weights say."""
         if not weights:
             return
         model = self.policy.world_model
@@ -167,9 +167,9 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         self.choose_who_acts()
 
     def choose_who_acts(self) -> None:
-        """Let the clone (`ibrl`, `residual`) and the average actor act where keywords say so.
+        """Let prior actor (`ibrl`, `residual`) and average actor take part as keywords say.
 
-        The clone must be there. An average begins with the next update and is dropped at once.
+        The prior actor does so once it is trained. An average that is switched off is dropped.
         """
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
         self.policy.residual = self.hyperparameters.residual and self.progress.cloned

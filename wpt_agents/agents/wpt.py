@@ -41,7 +41,7 @@ from wpt_agents.training.rollout import Window
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
     "model.prior stays None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, "
-    "kickstart=0 if this is intended"
+    "kickstart=0, without ibrl and residual, if this is intended"
 )
 
 
@@ -209,9 +209,11 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def _warn_without_dataset(self) -> None:
         """Warn if the missing dataset prevents cloning or rehearsal."""
-        if not self.progress.retrieved_ids:
+        settings = self.hyperparameters
+        lacks_clone = settings.needs_clone and not self.progress.cloned
+        if lacks_clone or not self.progress.retrieved_ids:
             warnings.warn(NO_DATASET, stacklevel=4)
-        elif self.hyperparameters.offline_ratio:
+        elif settings.offline_ratio:
             what = "Without its dataset the model rehearses nothing: load it with dataset="
             warnings.warn(f"{what}, or with offline_ratio=0 if this is intended", stacklevel=4)
 
@@ -224,14 +226,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.policy.prior_actor,
             self.retrieved.trajectories,
             self.policy.action_mask,
-            Cloning(
-                settings.value("bc_steps"),
-                settings.value("bc_batch_size"),
-                settings.bc_learning_rate,
-                settings.bc_shift,
-                settings.bc_variance,
-                settings.grad_clip,
-            ),
+            Cloning.of(settings, settings.grad_clip),
             self.streams,
             progress_bar,
             self.learner.autocast,
@@ -274,28 +269,31 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def update(self, metrics: Metrics) -> None:
         """Make one update of every network on a mixed batch; append to `metrics`."""
-        settings = self.hyperparameters
         progress = self.progress
-        self.adapt_to_data(self.replay_buffer)
-        self.learn_ends()
-        self.fit_reward_ensemble()
-        head_start = self.head_start > 0
-        if settings.residual and progress.cloned and not head_start:
-            self.begin_residual()
-        if settings.actor_critic_decay:
-            left = 1 - progress.num_timesteps / max(self._total_timesteps, 1)
-            self.learner.set_actor_critic_rate(max(left, 0.0))
+        self.prepare_update()
         batch = self.mixed_batch()
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
             update = self.learner.update(
-                batch, generator, progress.num_timesteps, self.imitation_weight(), head_start
+                batch, generator, self.num_timesteps, self.imitation_weight(), self.head_start > 0
             )
         for name, value in update.items():
             metrics[name].append(value)
         self.policy.average(self.averaging())
         progress.updates += 1
         progress.task_updates += 1
+
+    def prepare_update(self) -> None:
+        """Adapt a new world model, add networks that are now needed, and set learning rates."""
+        settings = self.hyperparameters
+        self.adapt_to_data(self.replay_buffer)
+        self.learn_ends()
+        self.fit_reward_ensemble()
+        if settings.residual and self.progress.cloned and not self.head_start:
+            self.begin_residual()
+        if settings.actor_critic_decay:
+            left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
+            self.learner.set_actor_critic_rate(max(left, 0.0))
 
     def mixed_batch(self) -> Batch:
         """Draw the batch of the next update: collected sequences, then retrieved ones."""
@@ -324,8 +322,9 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def collected_returns(self) -> tuple[list[float], list[float]]:
         """Return the returns of the collected trajectories, of the warm-up and of later ones.
 
-        With several environments it depends on the order in which episodes end which of those
-        around the end of the warm-up belong to it.
+        A trajectory is of the warm-up if fewer than `warmup_steps` steps are stored before it. Of
+        several environments, whose episodes are stored one after the other although they run at
+        the same time, this can be wrong for those that were open when the warm-up ended.
         """
         returns: tuple[list[float], list[float]] = ([], [])
         start = 0  # the number of steps before a trajectory
@@ -343,7 +342,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.learner.begin_imitator()
 
     def averaging(self) -> float:
-        """Return the share by which the average actor moves; it begins after the head start."""
+        """Return the share by which the average actor moves, 0 during the head start."""
         number = self.progress.task_updates - self.hyperparameters.actor_delay + 1
         share = self.hyperparameters.actor_average
         return debiased_fraction(share, number) if share and number > 0 else 0.0

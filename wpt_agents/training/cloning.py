@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Self
 
 from torch import Tensor
 from torch.optim import AdamW
@@ -19,6 +20,7 @@ from wpt_agents.model.behavior_cloning import (
     random_shift,
 )
 from wpt_agents.training.descent import descend
+from wpt_agents.training.keywords import Keywords
 from wpt_agents.training.randomness import Purpose, Streams
 
 
@@ -40,6 +42,12 @@ class Cloning:
     shift: int
     variance: str
     grad_clip: float = 100.0
+
+    @classmethod
+    def of(cls, keywords: Keywords, grad_clip: float = 100.0) -> Self:
+        """Read the keywords of an agent whose names begin with `bc_`."""
+        names = ("steps", "batch_size", "learning_rate", "shift", "variance")
+        return cls(grad_clip=grad_clip, **{name: keywords.value(f"bc_{name}") for name in names})
 
 
 def clone(

@@ -293,7 +293,8 @@ class Hyperparameters(Keywords):
         False,
         "act by the prior actor's action plus the difference between the actor and a copy of it "
         "that goes on imitating the prior actor, so that learning begins at the prior actor itself "
-        "and not at an imitation of it from latent states; not in the paper",
+        "and not at an imitation of it from latent states; not in the paper. Use it with "
+        "`kickstart`: where the actor does not imitate, the sum comes to be its own action",
         Stage.ACTING,
     )
     episode_length: int | None = count(

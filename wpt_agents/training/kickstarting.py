@@ -14,7 +14,7 @@ import numpy as np
 from wpt_agents.training.guidance import Schedule, parse_schedule
 
 RECENT = 5  # episodes whose mean return is compared
-FACTOR = 0.8  # of the weight after an episode
+FACTOR = 0.8  # by which an episode multiplies or divides the weight
 
 
 @dataclass(frozen=True)

@@ -119,19 +119,15 @@ class Learner(WorldModelLearner):
         :param head_start: train the actor on nothing but that imitation (`actor_delay`)
         """
         settings = self.hyperparameters
-        imitator = self.policy.imitator if settings.residual else None
-        advice = self.advice(batch) if imitation_weight or imitator is not None else None
+        corrects = settings.residual and self.policy.imitator is not None
+        advice = self.advice(batch) if imitation_weight or corrects else None
         states_loss = None
         if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
         post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
-        if advice is not None and imitator is not None and self.imitator_optimizer is not None:
-            metrics["train/correction"] = self.correction(imitator, post)
-            # Weighted as for the actor, so that the two differ by what imagination changes alone.
-            loss = self.imitation_loss(imitator, post, advice)
-            metrics["train/imitator_loss"] = loss.detach()
-            self.descend(self.imitator_optimizer, (imitation_weight or 1.0) * loss, "imitator")
+        if advice is not None and corrects:
+            metrics |= self.update_imitator(post, advice, imitation_weight)
         imitation: Tensor | float = 0.0
         if advice is not None and imitation_weight:
             loss = self.imitation_loss(self.policy.actor, post, advice)
@@ -170,6 +166,23 @@ class Learner(WorldModelLearner):
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
         with self.autocast():
             return bc_loss(actor.dist(feat, mask).mode, advice, mask)
+
+    def update_imitator(self, post: Latent, advice: Tensor, imitation_weight: float) -> Metrics:
+        """Take a step on the imitation loss of the imitator, with which `residual` compares.
+
+        :param post: (B, T, ...), the states of the replayed steps
+        :param advice: (B (T - 2), A), the prior actor's actions
+        :param imitation_weight: of the actor's own imitation. The imitator has the same, so that
+            the two differ by what imagination changes alone; it goes on where the actor's is 0
+        """
+        imitator = self.policy.imitator
+        optimizer = self.imitator_optimizer
+        if imitator is None or optimizer is None:
+            return {}
+        correction = self.correction(imitator, post)
+        loss = self.imitation_loss(imitator, post, advice)
+        self.descend(optimizer, (imitation_weight or 1.0) * loss, "imitator")
+        return {"train/correction": correction, "train/imitator_loss": loss.detach()}
 
     @torch.no_grad()
     def correction(self, imitator: Actor, post: Latent) -> Tensor:

@@ -332,6 +332,15 @@ def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
     assert "collect.tasks" not in str(error.value)  # which the user's data replace
 
 
+@pytest.mark.parametrize("method", ["wpt", "pretrain-only", "r3m"])
+def test_data_without_a_trajectory_are_refused_before_any_work(method, tmp_path):
+    TrajectoryDataset.create(tmp_path / "own").close()
+    where = "dmc", ["walker-walk"], "demo", tmp_path
+    with pytest.raises(ValueError, match=r"--data .*own holds no trajectories"):
+        plan(*where, method, data=tmp_path / "own")
+    assert plan(*where, "scratch", data=tmp_path / "own")  # which uses no data
+
+
 def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
     settings = ["collect.tasks=[dmc-quadruped-run, dmc-walker-walk]"]
     with pytest.raises(ValueError, match=r"The data have 12 actions.*6: --set max_action_dim=12"):

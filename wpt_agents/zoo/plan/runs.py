@@ -271,6 +271,11 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     :param widths: the numbers of actions that occur in the data
     """
     needed = run.task.action_dim
+    if run.algorithm.needs_data and not widths:
+        raise ValueError(
+            f"--data {run.data} holds no trajectories: collect or import some into it, or use "
+            "other --data"
+        )
     if run.retrieves and needed not in widths:
         add = "" if run.data is not None else "add such a task to collect.tasks (--set), "
         raise ValueError(

@@ -447,6 +447,20 @@ def test_settings_that_a_shipped_model_makes_void_are_refused_with_a_remedy_that
     assert plan(*where, settings=["size=mid"])  # as the preset's
 
 
+def test_a_shipped_model_can_start_another_preset_with_the_settings_that_the_error_names(tmp_path):
+    where = "metaworld", ["reach"], "debug", tmp_path, "wpt"
+    model = "pretrain.model=metaworld-mid"
+    with pytest.raises(ValueError, match=r"size=debug is not possible.*write --set size=mid as"):
+        plan(*where, [model])
+    assert plan(*where, [model, "size=mid"])
+    assert plan("metaworld", ["reach"], "debug", tmp_path, "scratch", [model])
+
+
+def test_a_shipped_model_that_does_not_exist_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match=r"'metaworld-mit'. Did you mean 'metaworld-mid'"):
+        plan("metaworld", ["reach"], "mid", tmp_path, "wpt", ["pretrain.model=metaworld-mit"])
+
+
 def test_a_setting_that_affects_one_of_the_methods_is_allowed(tmp_path):
     settings = ["sac.gamma=0.5", "plus.actor_delay=9"]
     request = Request("debug", "1", ["wpt", "wpt+", "sac"], settings, tmp_path)

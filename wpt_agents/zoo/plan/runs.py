@@ -19,7 +19,7 @@ from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
 from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY
-from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shape
+from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shipped
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset
 from wpt_agents.zoo.plan.request import Request
@@ -205,7 +205,7 @@ def make_plan(
     for method in methods:
         check_changes(method, changes)
     check_effects(changes, methods, preset, request.data)
-    check_shape(preset, load_preset(suite, request.preset, (), sections), methods)
+    check_shipped(preset, methods)
     runs = [
         Run(
             task=row,

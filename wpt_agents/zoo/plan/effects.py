@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_header
 from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import Hyperparameters
@@ -86,6 +87,22 @@ def from_shipped(preset: Preset) -> str:
         f"the preset starts from the shipped model {preset.pretrain.model}; add --set "
         "pretrain.model= to pre-train another"
     )
+
+
+def check_rewards(methods: Collection[str], data: Path | None) -> None:
+    """Raise an error for methods of true rewards without data that hold any.
+
+    :param data: the user's own dataset, None for the preset's, which has no rewards
+    """
+    for name in methods:
+        if METHODS[name].keywords.get("label") != "true":
+            continue
+        if data is None or not TrajectoryDataset.open(data).info()["with_reward"]:
+            raise ValueError(
+                f"--method {name} learns from the rewards in the data, and there are none in "
+                f"{'the data of a preset' if data is None else f'--data {data}'}: use --data with "
+                "rewards, as `collect --rewards` makes them, or --method uds or explore"
+            )
 
 
 def check_shipped(preset: Preset, methods: Collection[str]) -> None:

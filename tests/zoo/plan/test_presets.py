@@ -143,6 +143,12 @@ def test_seeds_that_are_none_are_refused(text):
         parse_seeds(text)
 
 
+def test_a_seed_that_a_run_would_stumble_over_is_refused():
+    assert parse_seeds("4294967295-4294967295") == [2**32 - 1]
+    with pytest.raises(ValueError, match="at most 4294967295"):
+        parse_seeds("0,4294967296")
+
+
 @pytest.mark.parametrize(
     ("patterns", "names"),
     [

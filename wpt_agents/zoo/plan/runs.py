@@ -27,6 +27,7 @@ from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
 
+LARGEST_SEED = 2**32 - 1  # of NumPy's older generators, which SB3 seeds
 EVALUATION = 1  # separates the seeds of evaluation from those of training
 
 
@@ -180,6 +181,8 @@ def parse_seeds(text: str) -> list[int]:
         seeds = []
     if not seeds:
         raise ValueError(f"--seeds {text!r}: write how many ('3'), which ('0,5') or '0-2'.")
+    if max(seeds) > LARGEST_SEED:
+        raise ValueError(f"--seeds {text!r}: a seed is at most {LARGEST_SEED}, take smaller ones")
     return list(dict.fromkeys(seeds))
 
 

@@ -109,6 +109,7 @@ def test_yaml_runs_no_code():
         ("dmc", "demo", ["lern.frames=1"], "section 'lern'.*Did you mean 'learn'"),
         ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),
         ("dmc", "demo", ["learn.frames=many"], "learn.frames must be of type int, got 'many'"),
+        ("dmc", "demo", ["collect.tasks=walker-run"], "list of names, got .walker-run"),
         ("dmc", "demo", ["learn.frames=1"], "at least 1, got 1 / 2"),
         ("dmc", "demo", ["evaluate.episodes=0"], "evaluate.episodes.*at least 1"),
         ("dmc", "demo", ["pretrain.steps=-1"], "pretrain.steps must not be negative"),

@@ -29,7 +29,12 @@ class Section:
             if key not in types:
                 raise unknown_name(f"{title} key", key, types)
             if not _fits(value, types[key]):
-                name = getattr(types[key], "__name__", types[key])
+                if types[key] not in (int, float, str, bool):
+                    example = f"--set '{title}.{key}=[NAME, NAME]'"
+                    raise ValueError(
+                        f"{title}.{key} must be a list of names, got {value!r}: write {example}"
+                    )
+                name = types[key].__name__
                 raise ValueError(f"{title}.{key} must be of type {name}, got {value!r}.")
             if types[key] is int and value < 0:
                 raise ValueError(f"{title}.{key} must not be negative, got {value}.")

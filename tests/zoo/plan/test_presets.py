@@ -110,6 +110,8 @@ def test_yaml_runs_no_code():
         ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),
         ("dmc", "demo", ["learn.frames=many"], "learn.frames must be of type int, got 'many'"),
         ("dmc", "demo", ["collect.tasks=walker-run"], "list of names, got .walker-run"),
+        ("dmc", "demo", ["sac.gamma=abc"], "gamma of SAC must be of type float.*got 'abc'"),
+        ("dmc", "demo", ["sac.train_freq=[1, episode]"], "train_freq of SAC must be of type int"),
         ("dmc", "demo", ["learn.frames=1"], "at least 1, got 1 / 2"),
         ("dmc", "demo", ["evaluate.episodes=0"], "evaluate.episodes.*at least 1"),
         ("dmc", "demo", ["pretrain.steps=-1"], "pretrain.steps must not be negative"),

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple, Self, get_type_hints
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.behaviours import EXPLORATION_KEYWORDS
-from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
+from wpt_agents.zoo.plan.methods import AGENTS, check_types, defaults, sections
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,8 @@ class Preset:
             for key in section:
                 if key not in defaults(AGENTS[name]):
                     raise unknown_name(f"{name} keyword", key, defaults(AGENTS[name]))
+            if not issubclass(AGENTS[name], PixelAgent):
+                check_types(AGENTS[name], section)
 
     def of_agent(self, agent: type[BaseAlgorithm]) -> dict[str, Any]:
         """Return the keywords in an agent's sections."""

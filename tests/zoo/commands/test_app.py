@@ -124,6 +124,22 @@ def test_pretrain_refuses_a_preset_that_starts_from_a_shipped_model(monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("max_action_dim=6", "The data have 12 actions, the preset's max_action_dim is 6: --set"),
+        ("collect.behaviour=policy", "No collect.behaviour 'policy'"),
+        ("env.rendering=fats", "Did you mean 'fast'"),
+    ],
+)
+def test_pretrain_refuses_settings_before_it_collects(
+    setting, message, monkeypatch, capsys, tmp_path
+):
+    words = ["pretrain", "--preset", "debug", "--out", tmp_path, "--set", setting]
+    assert call(monkeypatch, *words) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+
+
 def test_a_pre_trained_model_can_be_shared_as_the_shipped_ones_are(monkeypatch, capsys, tmp_path):
     store, shared = tmp_path / "data", tmp_path / "toy-mid.zip"
     with TrajectoryDataset.create(store) as dataset:

@@ -65,10 +65,16 @@ def read_model(
 def agent_of(path: str | os.PathLike[str]) -> str | None:
     """Return the class that wrote a model file; None if the file is none, as `read_model` tells."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            return str(json.loads(archive.read(ABOUT))["class"])
+        return str(read_header(path)["class"])
     except FAULTS:
         return None
+
+
+def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the JSON of a model file without reading or verifying its tensors."""
+    with zipfile.ZipFile(path) as archive:
+        header: dict[str, Any] = json.loads(archive.read(ABOUT))
+        return header
 
 
 def _read(file: BufferedIOBase, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:

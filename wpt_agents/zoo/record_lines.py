@@ -67,7 +67,8 @@ def read(path: Path) -> list[Line]:
     :raises ValueError: if the file is no record or is damaged
     """
     try:
-        with open(path, newline="", encoding="utf-8") as file:
+        # Spreadsheet programs write a mark at the beginning, which "utf-8" would take for a name.
+        with open(path, newline="", encoding="utf-8-sig") as file:
             return [_parse(row) for row in csv.DictReader(file)]
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(
@@ -88,7 +89,9 @@ PARSERS: Mapping[str, Callable[[str], Any]] = {
 }
 
 
-def _parse(row: Mapping[str, str]) -> Line:
+def _parse(row: Mapping[Any, Any]) -> Line:
+    if None in row or None in row.values():  # as `DictReader` marks them
+        raise ValueError(f"a line has too many or too few cells: {list(row.values())}")
     cells = {name: row.get(name, "") if name in OPTIONAL else row[name] for name in COLUMNS}
     return Line(*(PARSERS.get(name, str)(text) for name, text in cells.items()))
 

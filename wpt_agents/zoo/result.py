@@ -292,4 +292,10 @@ def _from_json(stored: dict[str, Any]) -> Result:
         names = {"WPT, last": LAST, "WPT": BEST}
     scores = {names.get(name, name): score for name, score in scores.items()}
     stored.pop("command", None)
-    return Result(variant=variant, scores=scores, **stored)
+    result = Result(variant=variant, scores=scores, **stored)
+    if result.final_policy not in scores:
+        raise KeyError(result.final_policy)
+    for name, score in scores.items():
+        if not score.returns or (result.metric == "success" and not score.successes):
+            raise ValueError(f"the score of {name} lacks episodes")
+    return result

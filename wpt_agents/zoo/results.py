@@ -22,18 +22,22 @@ def unless_damaged(read: Callable[[Path], Content], path: Path) -> Content | Non
         return None
 
 
+def find_every(folder: Path) -> dict[Path, Result]:
+    """Return the result of every run folder below `folder`, also of copies, in their order."""
+    folders = [file.parent for file in sorted(folder.glob(f"**/{FILE}"))]
+    results = ((path, unless_damaged(read_result, path)) for path in folders)
+    return {path: result for path, result in results if result is not None}
+
+
 def find_results(folder: Path) -> dict[Path, Result]:
     """Return the result of every finished run below `folder`, in the order of their paths.
 
     :raises ValueError: if a run exists twice, which would count as two seeds
     """
-    results = {}
+    results = find_every(folder)
     seen: dict[object, Path] = {}
-    for path in sorted(folder.glob(f"**/{FILE}")):
-        result = unless_damaged(read_result, path.parent)
-        if result is not None:
-            check_new(result.identity, path.parent, seen)
-            results[path.parent] = result
+    for path, result in results.items():
+        check_new(result.identity, path, seen)
     return results
 
 

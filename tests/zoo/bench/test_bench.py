@@ -132,7 +132,7 @@ def test_the_other_cases_yield_rows():
 
 @pytest.mark.nightly  # half a minute
 def test_scaling_tells_the_cost_of_a_unit_and_draws_it(tmp_path):
-    picture = tmp_path / "growth.png"
+    picture = tmp_path / "new" / "growth.png"
     arguments = ["bench", "scaling", "--quick", "--json", "--plot", str(picture)]
     ran = CliRunner().invoke(app, arguments)
     assert ran.exit_code == 0, ran.output

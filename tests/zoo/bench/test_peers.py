@@ -47,6 +47,7 @@ def test_a_peer_that_is_not_here_is_named_with_the_line_that_installs_it(monkeyp
             ["policy", "--compile"],
             "--compile goes with bench model and bench gpu, and not with --peer",
         ),
+        (["scaling", "--plot", "x.txt"], "--plot x.txt: a picture can be of the types eps, "),
         (["model", "--plot", "x.png"], "--plot goes with bench scaling, not with bench model"),
     ],
 )

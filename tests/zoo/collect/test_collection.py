@@ -300,6 +300,9 @@ def test_the_label_tells_how_to_make_the_data_again(tmp_path):
         ({"behaviour": "policy", "policy": "sacc:no.zip"}, "Did you mean 'sac'"),
         ({"behaviour": "scripted"}, "Meta-World's tasks only"),
         ({"sigmas": [0.5]}, r"sigmas \(--sigma\) have no effect on the behaviour 'noise'"),
+        ({"sigmas": [0.5, -0.5]}, r"numbers of at least 0, got \[0.5, -0.5\]"),
+        ({"sigmas": [float("nan")]}, "numbers of at least 0"),
+        ({"sigmas": []}, "numbers of at least 0"),
         ({"behaviour": "icm", "sigmas": [0.5]}, "take scripted or policy"),
         ({"settings": {"gamma": 0.9}}, r"settings \(--set\) have no effect on .* 'noise'"),
         (

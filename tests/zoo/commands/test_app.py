@@ -1,7 +1,9 @@
 """The command line end to end: help, refusals, dry runs, and a whole benchmark of the toy task."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import yaml
 from debug_agent import recorded
@@ -122,6 +124,22 @@ def test_pretrain_refuses_a_preset_that_starts_from_a_shipped_model(monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("max_action_dim=6", "The data have 12 actions, the preset's max_action_dim is 6: --set"),
+        ("collect.behaviour=policy", "No collect.behaviour 'policy'"),
+        ("env.rendering=fats", "Did you mean 'fast'"),
+    ],
+)
+def test_pretrain_refuses_settings_before_it_collects(
+    setting, message, monkeypatch, capsys, tmp_path
+):
+    words = ["pretrain", "--preset", "debug", "--out", tmp_path, "--set", setting]
+    assert call(monkeypatch, *words) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+
+
 def test_a_pre_trained_model_can_be_shared_as_the_shipped_ones_are(monkeypatch, capsys, tmp_path):
     store, shared = tmp_path / "data", tmp_path / "toy-mid.zip"
     with TrajectoryDataset.create(store) as dataset:
@@ -147,6 +165,21 @@ def test_a_dry_run_ends_in_what_the_run_would_be_refused_for(monkeypatch, capsys
     assert call(monkeypatch, "run", *words, "--out", tmp_path / "runs") == 2
     printed = capsys.readouterr()
     assert "1 of 1 run to do" in printed.out and "--device cuda:99" in printed.err
+
+
+def test_true_rewards_are_asked_for_before_any_work_with_a_remedy_that_works(
+    monkeypatch, capsys, tmp_path
+):
+    words = ["run", "--tasks", "walker-walk", "--preset", "debug", "--dry-run", "--out", tmp_path]
+    words += ["--method", "rlpd"]
+    assert call(monkeypatch, *words) == 2
+    assert "none in the data of a preset: use --data with rewards" in capsys.readouterr().err
+    for reward, ends_in in ((None, 2), (np.ones(9, np.float32), 0)):
+        folder = tmp_path / f"ends in {ends_in}"
+        with TrajectoryDataset.create(folder) as data:
+            data.append(replace(recorded(9, actions=6), reward=reward))
+        assert call(monkeypatch, *words, "--data", folder) == ends_in
+        assert (f"none in --data {folder}" in capsys.readouterr().err) == (reward is None)
 
 
 def test_a_dry_run_marks_the_runs_that_a_record_has(monkeypatch, capsys, tmp_path):

@@ -113,14 +113,14 @@ def test_the_sheet_of_a_run_shows_what_the_run_retrieves(dataset, images, tmp_pa
 def test_retrieve_show_draws_the_query_and_what_was_found(dataset, tmp_path, monkeypatch, capsys):
     agent(DotEnv()).save(tmp_path / "model.zip")
     # of a folder, as that of a run or of a pre-training, its model file is used
-    words = [dataset.path, "--model", tmp_path, "--out", tmp_path / "found.png"]
+    words = [dataset.path, "--model", tmp_path, "--out", tmp_path / "new" / "found.png"]
     assert call(monkeypatch, "retrieve", "show", *words, "--query", 3, "--number", 1) == 0
-    assert str(tmp_path / "found.png") in capsys.readouterr().out.replace("\n", "")
-    shown = colours(tmp_path / "found.png")
+    assert str(tmp_path / "new" / "found.png") in capsys.readouterr().out.replace("\n", "")
+    shown = colours(tmp_path / "new" / "found.png")
     assert {(200, 0, 0), (200, 0, 10)} <= shown  # the query and its nearest
     assert (30, 30, 30) not in shown  # no dot
     assert call(monkeypatch, "retrieve", "show", *words) == 0
-    assert (30, 30, 30) in colours(tmp_path / "found.png")
+    assert (30, 30, 30) in colours(tmp_path / "new" / "found.png")
 
 
 @pytest.mark.parametrize(

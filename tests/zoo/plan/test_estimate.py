@@ -84,6 +84,9 @@ def test_hours_come_from_finished_runs_of_the_preset(tmp_path):
     assert "time unknown until" in summary(jobs)
     make_run(tmp_path, "dmc-walker-run", preset="toy", frames=1000)  # 2 seconds
     assert hours_needed(jobs, jobs[0]) == pytest.approx(2 / 1000 * 150 / 3600)
+    finished = tmp_path / "toy" / "wpt" / "dmc-walker-run_0"
+    shutil.copytree(finished, finished.with_suffix(".bak"))  # which only a report refuses
+    assert hours_needed(jobs, jobs[0]) == pytest.approx(2 / 1000 * 150 / 3600)
     other = [replace(one, preset_name="other") for one in jobs]
     assert hours_needed(other, other[0]) is None
 

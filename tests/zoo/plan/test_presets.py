@@ -109,6 +109,9 @@ def test_yaml_runs_no_code():
         ("dmc", "demo", ["lern.frames=1"], "section 'lern'.*Did you mean 'learn'"),
         ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),
         ("dmc", "demo", ["learn.frames=many"], "learn.frames must be of type int, got 'many'"),
+        ("dmc", "demo", ["collect.tasks=walker-run"], "list of names, got .walker-run"),
+        ("dmc", "demo", ["sac.gamma=abc"], "gamma of SAC must be of type float.*got 'abc'"),
+        ("dmc", "demo", ["sac.train_freq=[1, episode]"], "train_freq of SAC must be of type int"),
         ("dmc", "demo", ["learn.frames=1"], "at least 1, got 1 / 2"),
         ("dmc", "demo", ["evaluate.episodes=0"], "evaluate.episodes.*at least 1"),
         ("dmc", "demo", ["pretrain.steps=-1"], "pretrain.steps must not be negative"),
@@ -141,6 +144,12 @@ def test_seeds_are_how_many_or_which(text, seeds):
 def test_seeds_that_are_none_are_refused(text):
     with pytest.raises(ValueError, match="how many"):
         parse_seeds(text)
+
+
+def test_a_seed_that_a_run_would_stumble_over_is_refused():
+    assert parse_seeds("4294967295-4294967295") == [2**32 - 1]
+    with pytest.raises(ValueError, match="at most 4294967295"):
+        parse_seeds("0,4294967296")
 
 
 @pytest.mark.parametrize(
@@ -332,6 +341,15 @@ def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
     assert "collect.tasks" not in str(error.value)  # which the user's data replace
 
 
+@pytest.mark.parametrize("method", ["wpt", "pretrain-only", "r3m"])
+def test_data_without_a_trajectory_are_refused_before_any_work(method, tmp_path):
+    TrajectoryDataset.create(tmp_path / "own").close()
+    where = "dmc", ["walker-walk"], "demo", tmp_path
+    with pytest.raises(ValueError, match=r"--data .*own holds no trajectories"):
+        plan(*where, method, data=tmp_path / "own")
+    assert plan(*where, "scratch", data=tmp_path / "own")  # which uses no data
+
+
 def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
     settings = ["collect.tasks=[dmc-quadruped-run, dmc-walker-walk]"]
     with pytest.raises(ValueError, match=r"The data have 12 actions.*6: --set max_action_dim=12"):
@@ -436,6 +454,20 @@ def test_settings_that_a_shipped_model_makes_void_are_refused_with_a_remedy_that
         plan(*where, settings=[setting])
     assert plan(*where, settings=[setting, "pretrain.model="])
     assert plan(*where, settings=["size=mid"])  # as the preset's
+
+
+def test_a_shipped_model_can_start_another_preset_with_the_settings_that_the_error_names(tmp_path):
+    where = "metaworld", ["reach"], "debug", tmp_path, "wpt"
+    model = "pretrain.model=metaworld-mid"
+    with pytest.raises(ValueError, match=r"size=debug is not possible.*write --set size=mid as"):
+        plan(*where, [model])
+    assert plan(*where, [model, "size=mid"])
+    assert plan("metaworld", ["reach"], "debug", tmp_path, "scratch", [model])
+
+
+def test_a_shipped_model_that_does_not_exist_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match=r"'metaworld-mit'. Did you mean 'metaworld-mid'"):
+        plan("metaworld", ["reach"], "mid", tmp_path, "wpt", ["pretrain.model=metaworld-mit"])
 
 
 def test_a_setting_that_affects_one_of_the_methods_is_allowed(tmp_path):

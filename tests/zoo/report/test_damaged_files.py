@@ -1,5 +1,6 @@
 """A damaged file in one run folder is named, and the report shows everything else."""
 
+import json
 import warnings
 
 import pytest
@@ -41,6 +42,20 @@ def test_a_run_that_failed_is_named_beside_the_means(form, runs, tmp_path, monke
 def runs(tmp_path):
     """Two runs of which the first one will be damaged."""
     return [make_run(tmp_path, "dmc-walker-run", seed, returns=(700.0, 800.0)) for seed in (0, 1)]
+
+
+@pytest.mark.parametrize("lacking", ["successes", "returns", "last"])
+def test_a_result_without_what_counts_is_left_out(lacking, tmp_path):
+    folders = [make_run(tmp_path, "metaworld-reach", seed) for seed in (0, 1)]
+    content = json.loads((folders[0] / "result.json").read_text())
+    if lacking == "last":
+        del content["scores"]["last"]
+    else:
+        content["scores"]["random"][lacking] = []
+    (folders[0] / "result.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"Left out: .*reach_0/result.json is damaged"):
+        write_page(tmp_path, tmp_path / "index.html")
+    assert (tmp_path / "index.html").read_text().count('class="run" id=') == 1
 
 
 @pytest.mark.parametrize("how", [empty, cut])

@@ -193,6 +193,18 @@ def test_another_csv_is_refused(tmp_path):
         record.read(tmp_path / "other.csv")
 
 
+def test_a_record_saved_by_a_spreadsheet_is_read_and_one_with_a_cut_line_is_refused(tmp_path):
+    path = tmp_path / "results.csv"
+    lines = record.update(path, [line("wpt", 50.0), line("scratch", 40.0)])
+    content = path.read_bytes()
+    path.write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n"))
+    assert record.read(path) == lines
+    for wrong in (content.rstrip().removesuffix(b",,,,"), content.rstrip() + b",x\n"):
+        path.write_bytes(wrong)
+        with pytest.raises(ValueError, match=r"too many or too few cells: \['dmc', 'dmc-a'"):
+            record.read(path)
+
+
 def test_a_benchmark_counts_as_much_as_the_other_whatever_its_number_of_tasks():
     lines = [
         *[line("wpt", 0.0, f"dmc-{i}", seed) for i in range(3) for seed in range(2)],

@@ -25,7 +25,7 @@ from wpt_agents.training.learner import Learner
 from wpt_agents.zoo import locks
 from wpt_agents.zoo.locks import locked
 from wpt_agents.zoo.provenance import commit
-from wpt_agents.zoo.run import checkpoints, learning, runner
+from wpt_agents.zoo.run import checkpoints, engines, learning, runner
 from wpt_agents.zoo.run.checkpoints import last_checkpoint
 from wpt_agents.zoo.run.evaluating import file_hash
 from wpt_agents.zoo.run.progress import LearningBar
@@ -113,6 +113,21 @@ def test_a_run_killed_thrice_equals_an_undisturbed_one(method, tmp_path, monkeyp
     assert "continued at 125 of" in capsys.readouterr().out
     assert_equal(left(broken.folder), left(whole.folder))
     assert not (broken.folder / "replay").exists()
+
+
+def test_a_killed_run_goes_on_elsewhere_without_the_pretrained_model(tmp_path, monkeypatch):
+    whole, broken = (job(tmp_path / name, **CHANGES) for name in ("whole", "broken"))
+    killed_at(76, monkeypatch, broken)
+    assert not engines.needs_model(broken)
+    began_with = file_hash(broken.shared.model_path / "model.zip")
+    shutil.rmtree(broken.shared.model_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "pretrain", None)
+        finished = run(broken)
+    assert finished.pretrained == began_with and "pretrain" in finished.seconds
+    run(whole)
+    assert engines.needs_model(whole) and not engines.needs_model(job(tmp_path, "scratch"))
+    assert_equal(left(broken.folder), left(whole.folder))
 
 
 class SignalAt(LearningBar):

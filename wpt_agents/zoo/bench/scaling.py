@@ -57,6 +57,7 @@ def plot(measured: list[dict[str, Any]], path: Path) -> None:
         panel.xaxis.set_major_formatter("{x:g}")
         panel.set_ylim(bottom=0)
         panel.legend(fontsize="small")
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
 
 

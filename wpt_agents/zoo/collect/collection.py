@@ -6,6 +6,7 @@ Example::
 """
 
 import json
+import math
 import os
 import shutil
 from collections import deque
@@ -222,7 +223,9 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
 
 
 def _check_options(behaviour: str, sigmas: Sequence[float], settings: Mapping[str, Any]) -> None:
-    """Raise an error for options that have no effect on the behaviour."""
+    """Raise an error for options that are invalid or have no effect on the behaviour."""
+    if not sigmas or not all(0 <= sigma < math.inf for sigma in sigmas):
+        raise ValueError(f"sigmas (--sigma) must be numbers of at least 0, got {list(sigmas)}")
     if tuple(sigmas) != SIGMAS and behaviour not in NOISY:
         raise ValueError(
             f"sigmas (--sigma) have no effect on the behaviour {behaviour!r}: leave them out, or "

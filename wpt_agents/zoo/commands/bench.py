@@ -125,6 +125,8 @@ def bench(
         raise ValueError(f"--peer goes with bench model, not with bench {case}")
     if plot and case != Case.scaling:
         raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
+    if plot:
+        _check_picture(plot)
     if compiled and (peer or case not in (Case.model, Case.gpu)):
         raise ValueError("--compile goes with bench model and bench gpu, and not with --peer")
     if probe and case != Case.prediction:
@@ -161,6 +163,15 @@ def bench(
                     f'pip install "wpt-agents[{extra}]"'
                 ) from error
             typer.echo(f"bench {name} is left out: it needs {error.name}.", err=True)
+
+
+def _check_picture(path: Path) -> None:
+    """Raise an error for a type of picture that could not be written after the measurements."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    types = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in types:
+        raise ValueError(f"--plot {path}: a picture can be of the types {', '.join(types)}")
 
 
 # Options of some cases only: their keywords of `rows`, their names, and their defaults.

@@ -170,6 +170,7 @@ def pretrain_model(
     from wpt_agents.agents.wpt import WPT
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device, choose_threads
+    from wpt_agents.zoo.plan.checks import check_pretraining
     from wpt_agents.zoo.plan.effects import check_effects, from_shipped
     from wpt_agents.zoo.plan.methods import METHODS
     from wpt_agents.zoo.plan.presets import load_preset
@@ -183,6 +184,7 @@ def pretrain_model(
     if chosen.pretrain.model:
         raise ValueError(f"Nothing to pre-train: {from_shipped(chosen)}")
     check_effects([Change.parse(text).short for text in settings], METHODS, chosen, data)
+    check_pretraining(suite, chosen, data)
     choose_threads(chosen.size)
     shared = Shared(chosen, suite, out / "cache", workers, device, data, accumulate)
     with joined(local_device(device)) as world:

@@ -50,9 +50,19 @@ class Trained:
         return self.choose(self.load_agent(device), policy)
 
     def load_agent(self, device: str = "auto") -> BaseAlgorithm:
-        """Load the agent, without a dataset."""
+        """Load the agent, without a dataset.
+
+        :raises ValueError: if the file is damaged, or the agent's actions are not the task's
+        """
         check_device(device)
-        return self.method.agent.load(self.model, device=device)
+        agent = self.method.agent.load(self.model, device=device)
+        needed = TASKS[self.task].action_dim
+        if agent.action_space.shape != (needed,):
+            raise ValueError(
+                f"{self.model} acts in {agent.action_space}, and {self.task} takes {needed} "
+                "actions: name a task of the robot that the model was fine-tuned for (--task)"
+            )
+        return agent
 
     def choose(self, agent: BaseAlgorithm, policy: str) -> PolicyPredictor:
         """Return the agent ("wpt"), its prior actor ("prior"), or its actor alone ("actor").

@@ -1,6 +1,7 @@
 """Helpers for sheets of images: single images, titles, and short names."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +18,8 @@ def draw(axis: plt.Axes, image: np.ndarray, colour: str = MUTED, width: float = 
 
 
 def finish(figure: plt.Figure, path: str | os.PathLike[str], title: str) -> None:
-    """Write the figure to `path` under a title, and close it."""
+    """Write the figure to `path` under a title, in a new folder if need be, and close it."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.suptitle(title, fontsize=9, color=INK)
     figure.tight_layout(rect=(0, 0, 1, 1 - 0.2 / figure.get_figheight()), pad=0.4)
     figure.savefig(path, dpi=130, bbox_inches="tight")

@@ -4,6 +4,11 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from wpt_agents.agents.wpt import WPT
+from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.files.model_file import read_header
+from wpt_agents.files.names import unknown_name
+from wpt_agents.training.hyperparameters import Hyperparameters
+from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.plan.methods import AGENTS, METHODS, find_method, sections
 from wpt_agents.zoo.plan.presets import Preset, wpt_keywords
 from wpt_agents.zoo.plan.shared import shipped_for
@@ -84,14 +89,37 @@ def from_shipped(preset: Preset) -> str:
     )
 
 
-def check_shape(preset: Preset, unchanged: Preset, methods: Collection[str]) -> None:
-    """Raise an error for widths that the preset's shipped model does not have.
+def check_rewards(methods: Collection[str], data: Path | None) -> None:
+    """Raise an error for methods of true rewards without data that hold any.
 
-    :param unchanged: the preset without the user's changes
+    :param data: the user's own dataset, None for the preset's, which has no rewards
     """
+    for name in methods:
+        if METHODS[name].keywords.get("label") != "true":
+            continue
+        if data is None or not TrajectoryDataset.open(data).info()["with_reward"]:
+            raise ValueError(
+                f"--method {name} learns from the rewards in the data, and there are none in "
+                f"{'the data of a preset' if data is None else f'--data {data}'}: use --data with "
+                "rewards, as `collect --rewards` makes them, or --method uds or explore"
+            )
+
+
+def check_shipped(preset: Preset, methods: Collection[str]) -> None:
+    """Raise an error for a shipped model that does not exist, or whose widths the preset lacks."""
     chosen = [METHODS[name] for name in methods]
-    starts = any(one.pretrained and shipped_for(preset, one.agent) for one in chosen)
-    for name in WPT.shape_keywords if starts else ():
-        value = preset.wpt.get(name)
-        if value != unchanged.wpt.get(name):
-            raise ValueError(f"--set {name}={value} is not possible: {from_shipped(preset)}")
+    if not any(one.pretrained and shipped_for(preset, one.agent) for one in chosen):
+        return
+    name = preset.pretrain.model
+    if name not in shipped():
+        raise unknown_name("shipped model", name, shipped())
+    stored = Hyperparameters.of(read_header(shipped()[name])["hyperparameters"]).as_dict()
+    ours = Hyperparameters.of(preset.wpt).as_dict()
+    differ = [key for key in WPT.shape_keywords if ours[key] != stored[key]]
+    if differ:
+        not_possible = ", ".join(f"{key}={ours[key]}" for key in differ)
+        instead = " ".join(f"{key}={stored[key]}" for key in differ)
+        raise ValueError(
+            f"{not_possible} is not possible: {from_shipped(preset)}, or write --set {instead} as "
+            "in this model"
+        )

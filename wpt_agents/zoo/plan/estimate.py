@@ -10,7 +10,7 @@ from wpt_agents.files.names import counted
 from wpt_agents.model.sizes import SIZES, Size, find_size
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
-from wpt_agents.zoo.results import read_results
+from wpt_agents.zoo.results import find_every
 from wpt_agents.zoo.sequence_result import read_row
 
 STORED_STEP = 2_500  # bytes of an image in the dataset, which uses lossless compression
@@ -83,7 +83,7 @@ def hours_needed(left: Sequence[Run], like: Run) -> float | None:
     :return: the hours, None if no run of the preset is finished
     """
     folder = like.out / like.preset_name
-    known = read_results(folder) if folder.exists() else []
+    known = find_every(folder).values()  # a copy of a run took as long
     paces = [sum(result.seconds.values()) / result.frames for result in known]
     frames = sum(job.preset.learn.frames for job in left)
     return float(np.mean(paces)) * frames / 3600 if paces else None

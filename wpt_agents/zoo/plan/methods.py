@@ -119,6 +119,20 @@ def defaults(agent: type[BaseAlgorithm]) -> Mapping[str, Any]:
     }
 
 
+def check_types(agent: type[BaseAlgorithm], values: Mapping[str, Any]) -> None:
+    """Raise an error for text or nothing in place of a number, which SB3's agents do not check.
+
+    Our agents check their keywords themselves.
+    """
+    for name, value in values.items():
+        usual = defaults(agent)[name]
+        if isinstance(usual, int | float) and not isinstance(value, int | float):
+            raise ValueError(
+                f"{name} of {agent.__name__} must be of type {type(usual).__name__} as its default "
+                f"{usual!r}, got {value!r}"
+            )
+
+
 NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
 ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data except the replay buffer
 # DreamerV3 from scratch, with the settings of its code for images of DMControl. Differences: its

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple, Self, get_type_hints
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
 from wpt_agents.model.sizes import Size
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.collect.behaviours import EXPLORATION_KEYWORDS
-from wpt_agents.zoo.plan.methods import AGENTS, defaults, sections
+from wpt_agents.zoo.plan.methods import AGENTS, check_types, defaults, sections
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,12 @@ class Section:
             if key not in types:
                 raise unknown_name(f"{title} key", key, types)
             if not _fits(value, types[key]):
-                name = getattr(types[key], "__name__", types[key])
+                if types[key] not in (int, float, str, bool):
+                    example = f"--set '{title}.{key}=[NAME, NAME]'"
+                    raise ValueError(
+                        f"{title}.{key} must be a list of names, got {value!r}: write {example}"
+                    )
+                name = types[key].__name__
                 raise ValueError(f"{title}.{key} must be of type {name}, got {value!r}.")
             if types[key] is int and value < 0:
                 raise ValueError(f"{title}.{key} must not be negative, got {value}.")
@@ -155,6 +161,8 @@ class Preset:
             for key in section:
                 if key not in defaults(AGENTS[name]):
                     raise unknown_name(f"{name} keyword", key, defaults(AGENTS[name]))
+            if not issubclass(AGENTS[name], PixelAgent):
+                check_types(AGENTS[name], section)
 
     def of_agent(self, agent: type[BaseAlgorithm]) -> dict[str, Any]:
         """Return the keywords in an agent's sections."""

@@ -9,17 +9,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from wpt_envs.rendering import QUALITIES
 from wpt_envs.tasks import Task
 
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import Hyperparameters
-from wpt_agents.zoo.collect.collection import BEHAVIOURS
-from wpt_agents.zoo.collect.episodes import STATE_CURIOSITY
-from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shape
+from wpt_agents.zoo.plan.checks import action_widths, check_preset, too_wide
+from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shipped
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset
 from wpt_agents.zoo.plan.request import Request
@@ -27,6 +23,7 @@ from wpt_agents.zoo.plan.shared import Shared
 from wpt_agents.zoo.result import Change, Variant
 from wpt_agents.zoo.tasks import find_tasks, short_name
 
+LARGEST_SEED = 2**32 - 1  # of NumPy's older generators, which SB3 seeds
 EVALUATION = 1  # separates the seeds of evaluation from those of training
 
 
@@ -180,6 +177,8 @@ def parse_seeds(text: str) -> list[int]:
         seeds = []
     if not seeds:
         raise ValueError(f"--seeds {text!r}: write how many ('3'), which ('0,5') or '0-2'.")
+    if max(seeds) > LARGEST_SEED:
+        raise ValueError(f"--seeds {text!r}: a seed is at most {LARGEST_SEED}, take smaller ones")
     return list(dict.fromkeys(seeds))
 
 
@@ -205,7 +204,7 @@ def make_plan(
     for method in methods:
         check_changes(method, changes)
     check_effects(changes, methods, preset, request.data)
-    check_shape(preset, load_preset(suite, request.preset, (), sections), methods)
+    check_shipped(preset, methods)
     runs = [
         Run(
             task=row,
@@ -242,35 +241,17 @@ def effective_changes(settings: Sequence[str]) -> tuple[Change, ...]:
     return tuple(changes.values())
 
 
-def action_widths(suite: str, preset: Preset, data: Path | None) -> set[int]:
-    """Return the numbers of actions that occur in the data."""
-    if data is not None:
-        return set(TrajectoryDataset.open(data).action_dims)
-    return {row.action_dim for row in find_tasks(suite, preset.collect.tasks)}
-
-
-def check_preset(preset: Preset) -> None:
-    """Raise an error for values that have the right type but that the stages do not support."""
-    Hyperparameters.of(preset.wpt)
-    for name, value, known in (
-        ("env.rendering", preset.env.rendering, QUALITIES),
-        ("collect.behaviour", preset.collect.behaviour, set(BEHAVIOURS) - {"policy"}),
-    ):
-        if value not in known:
-            raise unknown_name(name, value, known)
-    if preset.collect.steps and preset.collect.behaviour != STATE_CURIOSITY:
-        raise ValueError(
-            f"collect.steps belongs to collect.behaviour={STATE_CURIOSITY}, and has no effect on "
-            f"{preset.collect.behaviour!r}: leave it out"
-        )
-
-
 def check_width(run: Run, widths: Collection[int]) -> None:
     """Raise an error for a task that does not fit the model or whose robot is not in the data.
 
     :param widths: the numbers of actions that occur in the data
     """
     needed = run.task.action_dim
+    if run.algorithm.needs_data and not widths:
+        raise ValueError(
+            f"--data {run.data} holds no trajectories: collect or import some into it, or use "
+            "other --data"
+        )
     if run.retrieves and needed not in widths:
         add = "" if run.data is not None else "add such a task to collect.tasks (--set), "
         raise ValueError(
@@ -283,7 +264,4 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     if limit is not None and widest > limit:
         whose = f"{short_name(run.task)} has" if needed == widest else "The data have"
         starts = run.algorithm.pretrained and run.shared.shipped
-        raise ValueError(
-            f"{whose} {widest} actions, the preset's max_action_dim is {limit}: "
-            f"--set max_action_dim={widest}{' pretrain.model=' if starts else ''}"
-        )
+        raise too_wide(whose, widest, limit, " pretrain.model=" if starts else "")

@@ -98,7 +98,7 @@ def read(record: Path) -> list[Point]:
     if not path.exists():
         return []
     try:
-        with open(path, newline="", encoding="utf-8") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:
             return [_parse(row) for row in csv.DictReader(file)]
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} does not hold learning curves ({error}); delete it") from None

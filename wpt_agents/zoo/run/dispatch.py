@@ -7,6 +7,7 @@ import typer
 
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.machine import ENGINES, check_machine, choose_threads
+from wpt_agents.zoo.plan.effects import check_rewards
 from wpt_agents.zoo.plan.estimate import check_space, summary
 from wpt_agents.zoo.plan.overview import show_plan
 from wpt_agents.zoo.plan.runs import Run
@@ -47,6 +48,7 @@ def check_resources(engine: str, resources: Resources) -> None:
 def check_plan(runs: Sequence[Run], engine: str, force: bool) -> None:
     """Raise an error in advance if machine, disk or folders do not allow the plan."""
     check_machine(engine, runs[0].device)
+    check_rewards({run.method for run in runs}, runs[0].data)
     check_space(runs)
     for run in runs:
         check_folder(run, force)

@@ -28,6 +28,7 @@ from wpt_agents.zoo.machine import check_machine, import_extra
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.result import read_result
 from wpt_agents.zoo.run import runner
+from wpt_agents.zoo.run.checkpoints import last_checkpoint
 from wpt_agents.zoo.run.folder import check_folder, clear
 from wpt_agents.zoo.run.shared import collect_data, pretrain
 from wpt_agents.zoo.run.watch import shown
@@ -77,7 +78,7 @@ def run_on(engine: str, jobs: Sequence[Run], force: bool, resources: Resources) 
         clear_all([job.folder for job in left])
     # A worker may have been killed, or have failed, between its result and the record.
     runner.record_finished([job for job in jobs if job not in left])
-    by_need = sorted(left, key=lambda job: job.algorithm.pretrained)
+    by_need = sorted(left, key=needs_model)
     shared = {job.shared.model_path: job for job in by_need if job.algorithm.needs_data}
     cpus = counted(resources.cpus, "CPU")
     say("engine", f"{engine}: {len(left)} of {counted(len(jobs), 'run')} to do, {cpus} each")
@@ -110,8 +111,16 @@ def make_shared(job: Run) -> None:
     """Execute the shared stages of `job`, with their output in the cache's `log.txt`."""
     with logged(job.shared.log):
         dataset = collect_data(job.shared)
-        if job.algorithm.pretrained:
+        if needs_model(job):
             pretrain(job.shared, dataset)
+
+
+def needs_model(job: Run) -> bool:
+    """Return whether a run needs the pre-trained model: if no checkpoint has its weights."""
+    if not job.algorithm.pretrained:
+        return False
+    checkpoint = last_checkpoint(job.folder)
+    return checkpoint is None or checkpoint.state.origin.pretrained is None
 
 
 def do(job: Run) -> None:

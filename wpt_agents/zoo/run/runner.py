@@ -121,15 +121,15 @@ def do_stages(job: Run) -> Result:
     clock = Clock()
     dataset = None
     start = None
+    checkpoint = last_checkpoint(job.folder)
+    before = checkpoint.state.origin if checkpoint is not None else Origin()
     if job.algorithm.needs_data:
         with clock("collect"):
             dataset = collect_data(job.shared)
-    if job.algorithm.pretrained:
+    if job.algorithm.pretrained and before.pretrained is None:  # else the checkpoint is enough
         assert dataset is not None, job.method
         with clock("pretrain"):
             start = pretrain(job.shared, dataset)
-    checkpoint = last_checkpoint(job.folder)
-    before = checkpoint.state.origin if checkpoint is not None else Origin()
     clock.add(before.seconds)
     # The file may change while the run learns, or before it is resumed.
     pretrained = before.pretrained or (file_hash(start) if start is not None else None)

@@ -137,11 +137,11 @@ def _learn_task(job: SequenceRun, number: int) -> Row:
     run = job.runs[number]
     run.folder.mkdir(parents=True, exist_ok=True)
     dataset = collect_data(run.shared) if run.algorithm.needs_data else None
+    checkpoint = last_checkpoint(run.folder)
     start = None
-    if run.algorithm.pretrained:
+    if run.algorithm.pretrained and number == 0 and checkpoint is None:
         assert dataset is not None, run.method
         start = pretrain(run.shared, dataset)
-    checkpoint = last_checkpoint(run.folder)
     prepare_logs(run, checkpoint)
     with closing(make_training_env(run)) as venv:
         agent: Any = _begin(job, number, venv, dataset, start, checkpoint)

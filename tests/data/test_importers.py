@@ -1093,6 +1093,12 @@ def test_a_damaged_image_or_record_of_rlds_is_named(tmp_path):
 # The command
 
 
+def test_the_command_prints_warnings_on_lines_of_their_own(tmp_path, monkeypatch, capsys):
+    save_npz(tmp_path / "in/0.npz", chain(5, size=32))
+    assert call(monkeypatch, "import", "npz", tmp_path / "in", tmp_path / "out") == 0
+    assert "\rWarning: Images of 32 x 32" in capsys.readouterr().err  # not beside the bar
+
+
 def test_the_command_converts_with_labels_and_prints_what_came_of_it(tmp_path, monkeypatch, capsys):
     save_npz(tmp_path / "in/0.npz", chain(5, size=64))
     labels = ["--embodiment", "walker", "--task", "run", "--rewards"]

@@ -105,6 +105,8 @@ def test_yaml_runs_no_code():
         ("dmv", "demo", [], "'dmv'.*Did you mean 'dmc'"),
         ("dmc", "demmo", [], "'demmo'.*Did you mean 'demo'"),
         ("dmc", "demo", ["gama=0.9"], "'gama'.*Did you mean 'gamma'"),
+        ("dmc", "demo", ["gama=0.9"], r"free_nats_mode, gamma, grad_clip.*, learn\.KEY, "),
+        ("dmc", "demo", ["frames=9"], r"Did you mean 'learn\.frames'"),
         ("dmc", "demo", ["learn.frame=1"], "learn key 'frame'.*Did you mean 'frames'"),
         ("dmc", "demo", ["lern.frames=1"], "section 'lern'.*Did you mean 'learn'"),
         ("dmc", "demo", ["frames=1"], "'frames'.*learn.frames"),

@@ -41,7 +41,7 @@ def learning_curve(
     if evaluations is not None:
         at, episodes = evaluations
         axes.plot(at, episodes.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
-    lines = {}
+    lines: dict[str, float] = {}
     for name, score in scores.items():
         if name == final_policy(scores):
             whose = "the agent at the end" if name == LAST else "the best of the evaluated agents"

@@ -653,15 +653,16 @@ def test_a_damaged_or_strange_hdf5_is_named(tmp_path):
 # Minari, recorded with Minari itself
 
 
-def record_minari(tmp_path, monkeypatch, trajectories, nested=False, **kwargs):
+def record_minari(tmp_path, monkeypatch, trajectories, nested=False, cameras=1, **kwargs):
     minari = pytest.importorskip("minari")
     pytest.importorskip("h5py")
     from minari.data_collector import EpisodeBuffer
 
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    names = ["pixels", "wrist"][:cameras]
     buffers = [
         EpisodeBuffer(
-            observations={"pixels": t.image} if nested else t.image,
+            observations=dict.fromkeys(names, t.image) if nested else t.image,
             actions=2 * t.action,
             rewards=t.reward.tolist(),
             terminations=(np.arange(len(t)) == len(t) - 1) & t.terminated,
@@ -673,7 +674,7 @@ def record_minari(tmp_path, monkeypatch, trajectories, nested=False, **kwargs):
     minari.create_dataset_from_buffers(
         "chain/test-v0",
         buffers,
-        observation_space=gym.spaces.Dict({"pixels": image}) if nested else image,
+        observation_space=gym.spaces.Dict(dict.fromkeys(names, image)) if nested else image,
         action_space=gym.spaces.Box(-2, 2, (2,), np.float32),
         **kwargs,
     )
@@ -695,11 +696,25 @@ def test_minari_episodes_come_back_as_they_were(tmp_path, monkeypatch, nested, f
 
 @pytest.mark.filterwarnings("ignore::UserWarning:minari")
 def test_a_minari_image_key_that_is_missing_or_not_there_is_named(tmp_path, monkeypatch):
-    record_minari(tmp_path, monkeypatch, [chain(9)], nested=True, jpeg_encoding=False)
-    with pytest.raises(ValueError, match="pass image_key, one of: pixels"):
+    record_minari(tmp_path, monkeypatch, [chain(9)], nested=True, cameras=2, jpeg_encoding=False)
+    with pytest.raises(ValueError, match=r"pass image_key \(--image-key\), one of: pixels, wrist"):
         open_episodes("chain/test-v0", "minari", **SMALL)[0]
-    with pytest.raises(ValueError, match="has no 'image'; there are: pixels"):
+    with pytest.raises(ValueError, match="has no 'image'; there are: pixels, wrist"):
         open_episodes("chain/test-v0", "minari", image_key="image", **SMALL)[0]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:minari")
+def test_the_only_images_in_a_minari_dictionary_need_no_image_key(tmp_path, monkeypatch):
+    old = chain(9)
+    record_minari(tmp_path, monkeypatch, [old], nested=True, jpeg_encoding=False)
+    check_same(open_episodes("chain/test-v0", "minari", **SMALL)[0], old)
+
+
+def test_a_minari_dataset_that_is_not_there_is_offered_for_download(tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="run: minari download kitchen/none-v0"):
+        open_episodes("kitchen/none-v0", "minari")
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning:minari")
@@ -1091,6 +1106,12 @@ def test_a_damaged_image_or_record_of_rlds_is_named(tmp_path):
 
 
 # The command
+
+
+def test_the_command_prints_warnings_on_lines_of_their_own(tmp_path, monkeypatch, capsys):
+    save_npz(tmp_path / "in/0.npz", chain(5, size=32))
+    assert call(monkeypatch, "import", "npz", tmp_path / "in", tmp_path / "out") == 0
+    assert "\rWarning: Images of 32 x 32" in capsys.readouterr().err  # not beside the bar
 
 
 def test_the_command_converts_with_labels_and_prints_what_came_of_it(tmp_path, monkeypatch, capsys):

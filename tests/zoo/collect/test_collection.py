@@ -274,6 +274,13 @@ def test_a_folder_with_other_settings_is_refused(tmp_path):
         collect(tmp_path / "data", [DOT], 2, seed=1, workers=1, progress_bar=False)
 
 
+def test_a_collection_that_failed_without_an_episode_can_be_corrected(tmp_path):
+    with pytest.raises(gym.error.Error, match="none"):
+        collect(tmp_path / "data", ["wpt/none-v0"], 1, workers=1, progress_bar=False)
+    dataset = collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
+    assert len(dataset) == 1 and dataset.tasks == [DOT]
+
+
 def test_a_dataset_that_collect_did_not_make_is_left_alone(tmp_path):
     collect(tmp_path / "data", [DOT], 1, workers=1, progress_bar=False)
     (tmp_path / "data" / "collect.json").unlink()

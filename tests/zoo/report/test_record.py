@@ -236,6 +236,7 @@ def test_the_command_writes_table_and_picture_beside_the_record(tmp_path):
         in (path.with_suffix(".md").read_text())
     )
     assert path.with_suffix(".png").stat().st_size > 1000
+    assert "small.csv; beside it small.md, small.png" in ran.output.replace("\n", "")
 
 
 @pytest.mark.parametrize("form", ["--markdown", "--csv"])

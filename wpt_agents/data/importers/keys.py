@@ -142,7 +142,7 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
     if image_key is not None:
         name = match(image_key, table)
         if name is None:
-            raise ValueError(f"needs an array {image_key!r}; there are: {', '.join(table)}. {ask}")
+            raise ValueError(f"needs an array {image_key!r}; there are: {', '.join(table)}; {ask}")
         return name, ()
     # the usual names come first; cameras are searched only if there is none
     name = first(IMAGES, table)

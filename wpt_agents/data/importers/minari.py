@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from wpt_agents.data.importers.episodes import Episodes, needs
+from wpt_agents.data.importers.keys import is_images
 from wpt_agents.data.trajectory import Trajectory
 
 
@@ -39,7 +40,14 @@ class MinariEpisodes(Episodes):
                 with _named(str(folder)):
                     self._data = minari.MinariDataset(inner if inner.exists() else folder)
             else:
-                self._data = minari.load_dataset(str(name))
+                try:
+                    self._data = minari.load_dataset(str(name))
+                except FileNotFoundError as error:
+                    raise FileNotFoundError(
+                        f"{name} is neither a folder nor a Minari dataset in "
+                        f"{local_minari('')}; to download one of Minari's, run: minari download "
+                        f"{name}"
+                    ) from error
         else:
             self._data = name
         self._name = self._data.spec.dataset_id
@@ -60,7 +68,7 @@ class MinariEpisodes(Episodes):
         parts = [self._actions(key, episode.actions) for key in self.action_keys or ("",)]
         action, low, high = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
         return self._trajectory(
-            self._leaf(episode.observations, self.image_key, "image_key"),
+            self._images(episode.observations),
             action,
             np.asarray(episode.rewards),
             source,
@@ -79,6 +87,13 @@ class MinariEpisodes(Episodes):
         # arrays of several keys are concatenated as columns, so each is flattened
         return chosen.reshape(len(chosen), -1), np.ravel(space.low), np.ravel(space.high)
 
+    def _images(self, observations: Any) -> np.ndarray:
+        """Return the images under `image_key`, or the only ones there are."""
+        pictures = list(_pictures(observations)) if self.image_key is None else []
+        if len(pictures) == 1:
+            return pictures[0]
+        return self._leaf(observations, self.image_key, "image_key")
+
     def _leaf(self, tree: Any, key: str | None, option: str) -> np.ndarray:
         """Return the array under a key in nested dictionaries.
 
@@ -91,7 +106,8 @@ class MinariEpisodes(Episodes):
             tree = tree[part]
         if isinstance(tree, dict):
             raise ValueError(
-                f"{self._name} has several arrays; pass {option}, one of: {', '.join(tree)}"
+                f"{self._name} has a dictionary of arrays; pass {option} "
+                f"(--{option.replace('_', '-')}), one of: {', '.join(tree)}"
             )
         return np.asarray(tree)
 
@@ -105,6 +121,15 @@ def _named(what: str) -> Iterator[None]:
         raise ValueError(
             f"{what} is damaged ({error}): download or record this Minari dataset again"
         ) from error
+
+
+def _pictures(tree: Any) -> Iterator[np.ndarray]:
+    """Iterate over the images in nested dictionaries."""
+    if isinstance(tree, dict):
+        for branch in tree.values():
+            yield from _pictures(branch)
+    elif is_images(np.asarray(tree)):
+        yield np.asarray(tree)
 
 
 def _parts(key: str | None) -> list[str]:

@@ -118,7 +118,12 @@ def collect(
     with dataset:
         dataset.reserve()  # before counting the missing episodes
         with progress(total, label, "episodes", dataset.appended, not progress_bar) as bar:
-            gather(dataset, tasks, episodes, recipe, workers, bar)
+            try:
+                gather(dataset, tasks, episodes, recipe, workers, bar)
+            finally:
+                # the folder of a mistake, such as another robot's policy, is free for another call
+                if dataset.appended == 0 and not any(dataset.path.glob("exploring-*")):
+                    (dataset.path / LABEL).unlink()
         for folder in dataset.path.glob("exploring-*"):
             shutil.rmtree(folder)
     return TrajectoryDataset.open(path)

@@ -1,5 +1,6 @@
 """The command that converts data in other formats: import."""
 
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -149,7 +150,10 @@ def _integers(option: str, text: str | None) -> list[int] | None:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.secho(f"Warning: {message}", fg="yellow", err=True)
+    from tqdm.auto import tqdm
+
+    with tqdm.external_write_mode(sys.stderr):  # on a line of its own, above the progress bar
+        typer.secho(f"Warning: {message}", fg="yellow", err=True)
 
 
 def print_summary(dataset: "TrajectoryDataset") -> None:

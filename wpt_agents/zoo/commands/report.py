@@ -78,3 +78,7 @@ def report(
         summary.show()
         where = escape(str(page.resolve()))
         console.print(f"Page: [bold]{where}[/bold]; beside it report.md, policies.csv")
+        if record is not None and summary.runs:
+            where = escape(str(record.resolve()))
+            names = ", ".join(record.with_suffix(end).name for end in (".md", ".png"))
+            console.print(f"Record: [bold]{where}[/bold]; beside it {names}")

@@ -41,21 +41,32 @@ def learning_curve(
     if evaluations is not None:
         at, episodes = evaluations
         axes.plot(at, episodes.mean(axis=1), "o-", color=INK, ms=4, label="evaluations")
+    lines: dict[str, float] = {}
     for name, score in scores.items():
         if name == final_policy(scores):
             whose = "the agent at the end" if name == LAST else "the best of the evaluated agents"
             _final_point(axes, max(frames, default=0), score, whose)
         else:
-            mean = score.mean
-            axes.axhline(mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
-            text = f"{name} {mean:.0f}"
-            axes.annotate(text, (0.01, mean), xycoords=("axes fraction", "data"), va="bottom")
+            lines[name] = score.mean
+            axes.axhline(score.mean, color=COLOURS.get(name, MUTED), ls="--", lw=1.2)
+    name_lines(axes, lines)
     axes.set(title=title, xlabel="simulator frames", ylabel="episode return")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(edgecolor="none", framealpha=0.9, loc="best")
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def name_lines(axes: Axes, lines: Mapping[str, float]) -> None:
+    """Write the name and height of each horizontal line above it, and above the text below."""
+    low, high = axes.get_ylim()
+    free = low
+    for name, height in sorted(lines.items(), key=lambda line: line[1]):
+        at = max(height, free)
+        text = f"{name} {height:.0f}"
+        axes.annotate(text, (0.01, at), xycoords=("axes fraction", "data"), va="bottom")
+        free = at + 0.05 * (high - low)  # the height of a line of text
 
 
 def _final_point(axes: Axes, at: float, score: Score, whose: str) -> None:

@@ -317,7 +317,10 @@ def _setting(text: str) -> dict[str, dict[str, Any]]:
             f"{t}.{k}" for t, s in types.items() if is_dataclass(s) for k in get_type_hints(s)
         }
         dotted |= {f"{name}.{k}" for name, agent in AGENTS.items() for k in defaults(agent)}
-        raise unknown_name("key for --set", key, {*wpt_keywords(), *dotted})
+        # Hundreds of keys would hide the hint; one with a wrong KEY lists those of its section.
+        sections = {f"{name.partition('.')[0]}.KEY" for name in dotted}
+        valid = wpt_keywords()
+        raise unknown_name("key for --set", key, {*valid, *dotted}, {*valid, *sections})
     try:
         return {title or "wpt": {key: read_yaml(value) if value.strip() else ""}}
     except yaml.YAMLError:

@@ -334,15 +334,15 @@ class Still(gym.Env):
 def test_a_robot_that_the_data_do_not_show_is_refused_before_any_work(tmp_path):
     settings = ["max_action_dim=12"]
     with pytest.raises(ValueError, match=r"quadruped-walk has 12 actions.*\(1, 6\).*collect.tasks"):
-        plan("dmc", ["quadruped-walk"], "demo", tmp_path, settings=settings)
-    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch", settings)
-    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, "pretrain-only", settings)
+        plan("dmc", ["quadruped-walk"], "tiny", tmp_path, settings=settings)
+    assert plan("dmc", ["quadruped-walk"], "tiny", tmp_path, "scratch", settings)
+    assert plan("dmc", ["quadruped-walk"], "tiny", tmp_path, "pretrain-only", settings)
     with TrajectoryDataset.create(tmp_path / "own") as dataset:
         dataset.append(recorded(actions=12))
     arguments = dict(settings=settings, data=tmp_path / "own")
-    assert plan("dmc", ["quadruped-walk"], "demo", tmp_path, **arguments)
+    assert plan("dmc", ["quadruped-walk"], "tiny", tmp_path, **arguments)
     with pytest.raises(ValueError, match=r"walker-walk has 6 actions.*\(12\)") as error:
-        plan("dmc", ["walker-walk"], "demo", tmp_path, **arguments)
+        plan("dmc", ["walker-walk"], "tiny", tmp_path, **arguments)
     assert "collect.tasks" not in str(error.value)  # which the user's data replace
 
 
@@ -358,8 +358,8 @@ def test_data_without_a_trajectory_are_refused_before_any_work(method, tmp_path)
 def test_data_that_are_too_wide_for_the_model_are_refused_before_any_work(tmp_path):
     settings = ["collect.tasks=[dmc-quadruped-run, dmc-walker-walk]"]
     with pytest.raises(ValueError, match=r"The data have 12 actions.*6: --set max_action_dim=12"):
-        plan("dmc", ["walker-walk"], "demo", tmp_path, settings=settings)
-    assert plan("dmc", ["walker-walk"], "demo", tmp_path, "scratch", settings)
+        plan("dmc", ["walker-walk"], "tiny", tmp_path, settings=settings)
+    assert plan("dmc", ["walker-walk"], "tiny", tmp_path, "scratch", settings)
 
 
 @pytest.mark.parametrize(
@@ -373,7 +373,7 @@ def test_a_choice_or_schedule_that_is_none_is_refused_before_any_work(setting, m
 
 def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_path):
     with pytest.raises(ValueError, match=r"has 12 actions.*is 6: --set max_action_dim=12"):
-        plan("dmc", ["quadruped-walk"], "demo", tmp_path, "scratch")
+        plan("dmc", ["quadruped-walk"], "tiny", tmp_path, "scratch")
 
 
 @pytest.mark.parametrize(

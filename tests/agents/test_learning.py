@@ -51,6 +51,6 @@ def test_the_optimum_is_known():
 @pytest.mark.filterwarnings("ignore:.*Monitor.*:UserWarning")
 def test_a_dot_is_pushed_to_its_target_from_scratch(learning_seed):
     model = WPT("WPTPolicy", DotEnv(), seed=learning_seed, **SETTINGS)
-    model.learn(2000)
+    model.learn(1800)
     reached, _ = evaluate_policy(model, DotEnv(), n_eval_episodes=20)
     assert reached >= 0.9 * best_return(20, seed=0)

@@ -5,7 +5,7 @@
     python tests/helpers/parts.py --seeds 3 --steps 825 --only imagine_starts=None  # equal CPU time
 
 Every variant changes one keyword (or two that belong together) of the settings of `make learn`, and
-learns for 1,000 steps, half of what `make learn` takes, so that faster and slower learning differ.
+learns for 1,000 steps, fewer than `make learn` takes, so that faster and slower learning differ.
 The columns are means over the seeds; the first also shows the value of each seed:
 
 * the return of 20 episodes as a share of the known optimum;

@@ -9,7 +9,7 @@ import pytest
 from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.plan.presets import load_preset
-from wpt_agents.zoo.plan.shared import shipped_for
+from wpt_agents.zoo.plan.shared import given_for
 from wpt_agents.zoo.record_lines import read
 
 ZOO = Path(__file__).parents[1] / "zoo"
@@ -44,6 +44,6 @@ def test_recorded_runs_of_the_unchanged_preset_began_with_the_shipped_file():
     for line in lines:
         word = line.method.removeprefix("prior actor, ").split(",")[0]
         method = METHODS["wpt" if word == "prior actor" else word]
-        name = shipped_for(load_preset(line.suite, "mid"), method.agent)
+        name = given_for(load_preset(line.suite, "mid"), method.agent)
         expected = digest(name)[:12] if method.pretrained and name else ""
         assert line.model_hash == expected, (line.task, line.method, line.seed)

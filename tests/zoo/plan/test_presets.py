@@ -13,6 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.drqv2 import DrQv2
 from wpt_agents.agents.jsrl import JSRL
+from wpt_agents.agents.mrq import MRQ
+from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.training.guidance import parse_schedule
 from wpt_agents.zoo.plan import presets
@@ -26,6 +28,7 @@ from wpt_agents.zoo.plan.presets import (
 )
 from wpt_agents.zoo.plan.request import Request
 from wpt_agents.zoo.plan.runs import make_plan, parse_seeds
+from wpt_agents.zoo.plan.shared import given_file
 from wpt_agents.zoo.run.learning import make_agent
 from wpt_agents.zoo.tasks import find_tasks
 
@@ -285,9 +288,9 @@ def test_all_methods_have_the_same_frames_evaluations_and_choice_of_the_best_pol
 def test_only_wpt_starts_from_the_world_model_of_the_library(preset, tmp_path):
     [ours] = plan("metaworld", ["reach"], preset, tmp_path, "wpt")
     [r3m] = plan("metaworld", ["reach"], preset, tmp_path, "r3m")
-    assert ours.shared.shipped == "metaworld-mid"
+    assert ours.shared.given_model == "metaworld-mid"
     assert r3m.algorithm.pretrained
-    assert not r3m.shared.shipped
+    assert not r3m.shared.given_model
 
 
 @pytest.mark.parametrize("name", ["wpt/metaworld-reach-v0", "metaworld-reach", "reach"])
@@ -473,6 +476,21 @@ def test_a_shipped_model_can_start_another_preset_with_the_settings_that_the_err
 def test_a_shipped_model_that_does_not_exist_is_refused_before_any_work(tmp_path):
     with pytest.raises(ValueError, match=r"'metaworld-mit'. Did you mean 'metaworld-mid'"):
         plan("metaworld", ["reach"], "mid", tmp_path, "wpt", ["pretrain.model=metaworld-mit"])
+
+
+def test_a_model_file_of_ones_own_can_start_a_run(tmp_path):
+    where = "metaworld", ["reach"], "debug", tmp_path
+    WPT(size="debug", max_action_dim=4).save(tmp_path / "own.zip")
+    settings = [f"pretrain.model={tmp_path}/own.zip", "max_action_dim=4"]
+    [run] = plan(*where, "wpt", settings)
+    assert given_file(run.shared.given_model) == tmp_path / "own.zip"
+    with pytest.raises(ValueError, match=r"the model .*own\.zip; add --set pretrain\.model= "):
+        plan(*where, "wpt", [*settings, "pretrain.steps=5"])
+    with pytest.raises(ValueError, match=r"other\.zip: there is no such file"):
+        plan(*where, "wpt", [f"pretrain.model={tmp_path}/other.zip"])
+    MRQ(channels=2, latent_dim=8, hidden_dim=8).save(tmp_path / "mrq.zip")
+    with pytest.raises(ValueError, match=r"mrq\.zip is of MRQ"):
+        plan(*where, "wpt", [f"pretrain.model={tmp_path}/mrq.zip"])
 
 
 def test_a_setting_that_affects_one_of_the_methods_is_allowed(tmp_path):

@@ -171,7 +171,7 @@ def pretrain_model(
     from wpt_agents.training.distributed import joined, local_device
     from wpt_agents.zoo.machine import check_device, choose_threads
     from wpt_agents.zoo.plan.checks import check_pretraining
-    from wpt_agents.zoo.plan.effects import check_effects, from_shipped
+    from wpt_agents.zoo.plan.effects import check_effects, from_given
     from wpt_agents.zoo.plan.methods import METHODS
     from wpt_agents.zoo.plan.presets import load_preset
     from wpt_agents.zoo.plan.shared import Shared
@@ -182,7 +182,7 @@ def pretrain_model(
     check_device(device)
     chosen = load_preset(suite, preset, settings)
     if chosen.pretrain.model:
-        raise ValueError(f"Nothing to pre-train: {from_shipped(chosen)}")
+        raise ValueError(f"Nothing to pre-train: {from_given(chosen)}")
     check_effects([Change.parse(text).short for text in settings], METHODS, chosen, data)
     check_pretraining(suite, chosen, data)
     choose_threads(chosen.size)

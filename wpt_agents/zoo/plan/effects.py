@@ -6,12 +6,11 @@ from pathlib import Path
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.files.model_file import read_header
-from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import Hyperparameters
-from wpt_agents.training.model_files import shipped
+from wpt_agents.training.model_files import check_class
 from wpt_agents.zoo.plan.methods import AGENTS, METHODS, find_method, sections
 from wpt_agents.zoo.plan.presets import Preset, wpt_keywords
-from wpt_agents.zoo.plan.shared import shipped_for
+from wpt_agents.zoo.plan.shared import given_file, given_for, named
 from wpt_agents.zoo.result import Change
 
 
@@ -65,8 +64,8 @@ def why_useless(
         return f"the section plus is only used by --method {with_plus}; {instead}"
     if section == "collect" and data is not None:
         return f"--data {data} takes the place of the preset's data; leave one of them out"
-    if section == "pretrain" and keyword != "model" and only_shipped(preset, methods):
-        return from_shipped(preset)
+    if section == "pretrain" and keyword != "model" and trains_none(preset, methods):
+        return from_given(preset)
     evaluated = keyword == "during_episodes" or (
         keyword == "keep_best" and preset.evaluate.keep_best
     )
@@ -75,17 +74,17 @@ def why_useless(
     return None
 
 
-def only_shipped(preset: Preset, methods: Collection[str]) -> bool:
-    """Return whether no pre-training is done, because a shipped model takes its place."""
+def trains_none(preset: Preset, methods: Collection[str]) -> bool:
+    """Return whether nothing is pre-trained, because a given model takes its place."""
     pretrained = [METHODS[name] for name in methods if METHODS[name].pretrained]
-    return bool(preset.pretrain.model) and all(shipped_for(preset, one.agent) for one in pretrained)
+    return bool(preset.pretrain.model) and all(given_for(preset, one.agent) for one in pretrained)
 
 
-def from_shipped(preset: Preset) -> str:
-    """Return the reason and the remedy if the preset starts from a shipped model."""
+def from_given(preset: Preset) -> str:
+    """Return the reason and the remedy if the preset starts from a pre-trained model."""
     return (
-        f"the preset starts from the shipped model {preset.pretrain.model}; add --set "
-        "pretrain.model= to pre-train another"
+        f"the preset starts from {named(preset.pretrain.model)}; add --set pretrain.model= to "
+        "pre-train another"
     )
 
 
@@ -105,21 +104,21 @@ def check_rewards(methods: Collection[str], data: Path | None) -> None:
             )
 
 
-def check_shipped(preset: Preset, methods: Collection[str]) -> None:
-    """Raise an error for a shipped model that does not exist, or whose widths the preset lacks."""
+def check_given_model(preset: Preset, methods: Collection[str]) -> None:
+    """Raise an error for a pre-trained model that does not exist or does not fit the preset."""
     chosen = [METHODS[name] for name in methods]
-    if not any(one.pretrained and shipped_for(preset, one.agent) for one in chosen):
+    if not any(one.pretrained and given_for(preset, one.agent) for one in chosen):
         return
-    name = preset.pretrain.model
-    if name not in shipped():
-        raise unknown_name("shipped model", name, shipped())
-    stored = Hyperparameters.of(read_header(shipped()[name])["hyperparameters"]).as_dict()
+    file = given_file(preset.pretrain.model)
+    header = read_header(file)
+    check_class(header, file, WPT.saved_as)
+    stored = Hyperparameters.of(header["hyperparameters"]).as_dict()
     ours = Hyperparameters.of(preset.wpt).as_dict()
     differ = [key for key in WPT.shape_keywords if ours[key] != stored[key]]
     if differ:
         not_possible = ", ".join(f"{key}={ours[key]}" for key in differ)
         instead = " ".join(f"{key}={stored[key]}" for key in differ)
         raise ValueError(
-            f"{not_possible} is not possible: {from_shipped(preset)}, or write --set {instead} as "
+            f"{not_possible} is not possible: {from_given(preset)}, or write --set {instead} as "
             "in this model"
         )

@@ -6,6 +6,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from wpt_agents.files.names import counted
+from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.plan.estimate import is_finished
 from wpt_agents.zoo.plan.runs import Run
 from wpt_agents.zoo.record_lines import Identity, read
@@ -42,8 +43,9 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
         console.print(f"dataset      {state}  {dim(path)}")
     models = {job.shared.model_path: job.shared for job in jobs if job.algorithm.pretrained}
     for path, shared in models.items():
-        if ships := shared.shipped:
-            console.print(f"world model  {ships}, which ships")
+        if model := shared.given_model:
+            ships = ", which ships" if model in shipped() else ""
+            console.print(f"world model  {model}{ships}")
             continue
         updates = counted(shared.preset.pretrain.steps, "update")
         state = "exists" if (path / "done.json").exists() else f"{updates} to make"

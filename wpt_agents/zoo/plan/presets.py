@@ -82,8 +82,8 @@ class CollectSettings(Section):
 class PretrainSettings(Section):
     """Pre-training of the world model, the same for every seed of a run.
 
-    `model` names a pre-trained model that comes with the library; `model=` (empty) trains a new one
-    with `steps` updates.
+    `model` is a pre-trained model of WPT: the path of a file, or the name of one that comes with
+    the library. `model=` (empty) trains a new one with `steps` updates.
     """
 
     steps: int = 200_000

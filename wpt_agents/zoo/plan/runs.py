@@ -15,7 +15,7 @@ from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.zoo.plan.checks import action_widths, check_preset, too_wide
-from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_shipped
+from wpt_agents.zoo.plan.effects import check_changes, check_effects, check_given_model
 from wpt_agents.zoo.plan.methods import Method, defaults, find_method
 from wpt_agents.zoo.plan.presets import Preset, load_preset
 from wpt_agents.zoo.plan.request import Request
@@ -204,7 +204,7 @@ def make_plan(
     for method in methods:
         check_changes(method, changes)
     check_effects(changes, methods, preset, request.data)
-    check_shipped(preset, methods)
+    check_given_model(preset, methods)
     runs = [
         Run(
             task=row,
@@ -263,5 +263,5 @@ def check_width(run: Run, widths: Collection[int]) -> None:
     widest = max(needed, *widths) if run.algorithm.needs_data else needed
     if limit is not None and widest > limit:
         whose = f"{short_name(run.task)} has" if needed == widest else "The data have"
-        starts = run.algorithm.pretrained and run.shared.shipped
+        starts = run.algorithm.pretrained and run.shared.given_model
         raise too_wide(whose, widest, limit, " pretrain.model=" if starts else "")

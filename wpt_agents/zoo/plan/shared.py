@@ -17,8 +17,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from wpt_agents.agents.base import PixelAgent
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.files.names import unknown_name
 from wpt_agents.training.hyperparameters import FINE_TUNING
 from wpt_agents.training.keywords import Stage
+from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.plan.presets import Preset
 from wpt_agents.zoo.tasks import find_tasks
 
@@ -29,12 +31,31 @@ def key(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
-def shipped_for(preset: Preset, agent: type[BaseAlgorithm]) -> str:
-    """Return the model of the library that replaces an agent's pre-training, or "".
+def given_for(preset: Preset, agent: type[BaseAlgorithm]) -> str:
+    """Return the pre-trained model that replaces an agent's pre-training, or "".
 
     These models are WPT's; other agents that need one are pre-trained.
     """
     return preset.pretrain.model if agent is WPT else ""
+
+
+def given_file(model: str) -> Path:
+    """Return the file of a pre-trained model, which a path or the name of a shipped model gives.
+
+    :raises ValueError: neither a file nor a shipped model
+    """
+    if Path(model).is_file():
+        return Path(model)
+    if model in shipped():
+        return shipped()[model]
+    if Path(model).suffix or Path(model).name != model:
+        raise ValueError(f"pretrain.model={model}: there is no such file")
+    raise unknown_name("shipped model", model, shipped())
+
+
+def named(model: str) -> str:
+    """Return a pre-trained model's path or name for a message."""
+    return f"the shipped model {model}" if model in shipped() else f"the model {model}"
 
 
 @dataclass(frozen=True)
@@ -99,9 +120,9 @@ class Shared:
         return 0 if self.given_data is not None else max(self.episodes - self.stored, 0)
 
     @property
-    def shipped(self) -> str:
-        """The model of the library that replaces pre-training, or ""."""
-        return shipped_for(self.preset, self.agent)
+    def given_model(self) -> str:
+        """The path or name of the model that replaces pre-training, or ""."""
+        return given_for(self.preset, self.agent)
 
     @property
     def model_path(self) -> Path:

@@ -14,14 +14,13 @@ from wpt_envs.tasks import Task
 
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
-from wpt_agents.files.names import counted, unknown_name
+from wpt_agents.files.names import counted
 from wpt_agents.training.distributed import World
-from wpt_agents.training.model_files import shipped
 from wpt_agents.zoo.collect.collection import collect, read_label
 from wpt_agents.zoo.judge.evaluation import evaluate
 from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.locks import locked
-from wpt_agents.zoo.plan.shared import Shared, key
+from wpt_agents.zoo.plan.shared import Shared, given_file, key, named
 from wpt_agents.zoo.result import Score, read_score, write_score
 from wpt_agents.zoo.terminal import say
 from wpt_agents.zoo.text_files import write_json
@@ -70,9 +69,9 @@ def _warn_of_differences(shared: Shared) -> None:
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: pre-train the model unless it is finished, and return its file."""
-    if name := shared.shipped:
-        say("pretrain", f"the shipped model {name}", shipped_model(name))
-        return shipped_model(name)
+    if model := shared.given_model:
+        say("pretrain", named(model), given_file(model))
+        return given_file(model)
     folder = shared.model_path
     world = World.current()
     model = folder / "model.zip"
@@ -89,13 +88,6 @@ def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
             if world.rank == 0:
                 write_json(done, {"seconds": round(time.perf_counter() - start, 1)})
     return model
-
-
-def shipped_model(name: str) -> Path:
-    """Return the file of a model that comes with the library."""
-    if name not in shipped():
-        raise unknown_name("shipped model", name, shipped())
-    return shipped()[name]
 
 
 def _pretrain(shared: Shared, dataset: TrajectoryDataset) -> None:

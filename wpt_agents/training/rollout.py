@@ -11,7 +11,8 @@ from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import State, stack_frames, to_images
-from wpt_agents.training.environments import innermost, last_observation
+from wpt_agents.training.ends import last_observation
+from wpt_agents.training.environments import innermost
 
 PATIENCE = 1800.0  # seconds that a worker process may take for a step; people may reset robots
 GO_ON = (

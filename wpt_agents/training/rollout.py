@@ -1,5 +1,6 @@
 """Collecting: the open episodes of several environments, and who decides on the actions."""
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -20,6 +21,8 @@ GO_ON = (
     "learn(..., reset_num_timesteps=False)"
 )
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
+WHOLE: Window = (0, sys.maxsize)  # of the warm-up: the whole episode, however long it lasts
+WARM_UP, LATER = "warm-up", "after the warm-up"  # the sources of collected trajectories
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 
@@ -155,6 +158,7 @@ class Rollout:
             np.array(self.rewards[i], np.float32),
             terminated,
             embodiment=self.embodiment,
+            source=WARM_UP if self.windows[i] == WHOLE else LATER,
         )
         self.images[i] = []
         self.actions[i] = []

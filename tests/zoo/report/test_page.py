@@ -7,13 +7,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from run_folders import make_run
+from run_folders import make_run, write_page
 
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import aggregates, figures, headline
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.folders import find_finished
-from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.report.paper_tables import Cell, TableRow, shared_note, without_notes
 from wpt_agents.zoo.results import read_results
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.record_lines import Identity, Line, csv_of, read
-from wpt_agents.zoo.report.aggregates import BEST_RETURN
+from wpt_agents.zoo.report.aggregates import normalised
 from wpt_agents.zoo.report.folders import Finished
 from wpt_agents.zoo.report.names import policy_name
 from wpt_agents.zoo.result import UNTRAINED, Result
@@ -42,7 +42,7 @@ def _lines(result: Result) -> Iterator[Line]:
             seed=result.seed,
             preset=result.variant if trained else result.variant.playing,
             frames=result.frames if trained else 0,
-            score=round(100 * (score.mean / BEST_RETURN if success is None else success), 2),
+            score=round(100 * normalised(score.counted(result.metric), result.metric), 2),
             return_=round(score.mean, 2),
             success=success,
             hours=round(sum(result.seconds.values()) / 3600, 4),

@@ -20,7 +20,7 @@ import wpt_agents
 from wpt_agents.zoo.collect.collection import BEHAVIOURS
 from wpt_agents.zoo.commands import app as command_line
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.plan.presets import load_preset, suite_names
+from wpt_agents.zoo.plan.presets import default_preset, load_preset, suite_names
 from wpt_agents.zoo.tasks import find_tasks
 
 ROOT = Path(__file__).parents[1]
@@ -72,8 +72,9 @@ def check(command):
     suite = options.get("suite") or "dmc"
     tasks = [task for task in options.get("tasks") or [] if "$" not in task]
     find_tasks(suite, tasks)
-    if options.get("preset") and suite in suite_names():
-        load_preset(suite, options["preset"], options.get("settings") or [])
+    if "preset" in options and suite in suite_names():
+        preset = options["preset"] or default_preset(suite)
+        load_preset(suite, preset, options.get("settings") or [])
     assert set(options.get("method") or []) <= set(METHODS)
     behaviour = options.get("behaviour") or []
     assert set([behaviour] if isinstance(behaviour, str) else behaviour) <= set(BEHAVIOURS)
@@ -104,6 +105,23 @@ def test_the_commands_of_the_records_are_understood(record):
     for command in said:
         assert command.startswith(program), command
         check(command.removeprefix(program))
+
+
+def datasets(text):
+    """The folders that the examples of a page make datasets in, each with the line that does it."""
+    lines = [*commands(text), *re.findall(r"`(import [^`]*)`", text), *blocks(text, "python")]
+    made = r"(?:collect .*--out|import \S+ \S+|data merge|\.create\(|\.open_or_create\()"
+    for line in lines:
+        yield from ((folder, line) for folder in re.findall(made + r' *"?(data/[^\s"$]+)', line))
+
+
+def test_no_two_examples_make_datasets_in_one_folder():
+    made = {}
+    for page, text in PAGES.items():
+        for folder, line in datasets(text):
+            first = made.setdefault(folder, (page, line))
+            assert line == first[1], (folder, page, first[0])  # the same command may be repeated
+    assert len(made) > 20
 
 
 def anchors(path):

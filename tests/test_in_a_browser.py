@@ -14,11 +14,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from run_folders import make_run
+from run_folders import make_run, write_page
 
 from wpt_agents import WPT
 from wpt_agents.zoo.plan.methods import METHODS
-from wpt_agents.zoo.report.page import write_page
 
 ROOT = Path(__file__).parents[1]
 WIDTHS = (390, 820, 1440)

@@ -72,7 +72,7 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if times < 1 or times != int(times):
             raise ValueError(f"action_repeat={times}: pass a whole number, 1 or more")
-        self._times = int(times)
+        self.times = int(times)
         self.metadata = dict(env.metadata)
         if "render_fps" in env.metadata:
             self.metadata["render_fps"] = env.metadata["render_fps"] / times
@@ -80,7 +80,7 @@ class RepeatAction(gym.Wrapper, RecordConstructorArgs):
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one step of the agent; return the last observation, the rewards' sum and info."""
         total = 0.0
-        for _ in range(self._times):
+        for _ in range(self.times):
             # a copy, since some environments scale the action in place
             obs, reward, terminated, truncated, info = self.env.step(copy(action))
             total += float(reward)

@@ -972,6 +972,18 @@ def test_the_adaptive_weight_goes_by_the_returns_since_the_warm_up(store):
     assert model.imitation_weight() == 20
 
 
+def test_every_episode_that_began_in_the_warm_up_counts_as_one_of_it(store):
+    settings = {"kickstart": "adaptive(20,1)", "warmup_steps": LENGTH}
+    env = DummyVecEnv([DotEnv, DotEnv])  # both first episodes begin before step 25
+    model = pretrained(store, env=env, **settings).learn(4 * LENGTH)
+    episodes = model.replay_buffer.trajectories
+    by_hand = [float(episode.reward.sum()) for episode in episodes]
+    assert model.collected_returns() == (by_hand[:2], by_hand[2:]) and len(by_hand) == 4
+    # Replay buffers of earlier versions do not say it; their steps in order must do.
+    episodes[:] = [replace(episode, source=None) for episode in episodes]
+    assert model.collected_returns() == (by_hand[:1], by_hand[1:])
+
+
 def moved_by(model, keyword, value):
     """The weights that an update changes otherwise if `keyword` is `value` instead of 0."""
     before = deepcopy(model.policy.state_dict())

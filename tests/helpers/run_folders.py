@@ -6,6 +6,7 @@ import numpy as np
 import yaml
 from imageio.v3 import imwrite
 
+from wpt_agents.zoo.report.summary import Summary
 from wpt_agents.zoo.result import Result, Score, Variant, write_result
 
 PIXELS = np.zeros((8, 24, 3), np.uint8)
@@ -58,3 +59,8 @@ def score(returns, metric):
     """A policy's score; an episode whose return is above 5 is a success."""
     successes = tuple(value > 5 for value in returns) if metric == "success" else ()
     return Score(tuple(map(float, returns)), successes)
+
+
+def write_page(folder, page, media="first"):
+    """Writes the page about the runs below a folder, and the tables beside it."""
+    Summary.of(folder).write(page, media)

@@ -7,10 +7,16 @@ from dataclasses import replace
 import gymnasium as gym
 import pytest
 from debug_agent import ClockEnv, agent, pretrained, recorded
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import DotEnv
+from wpt_envs.wrappers import RepeatAction
 
 from wpt_agents.agents.drqv2 import DrQv2
+from wpt_agents.training.ends import time_limit
+from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.outlook import Outlook
 
 SCRATCH = {"offline_ratio": 0.0, "guidance": 0.0, "warmup_steps": 0}
@@ -93,6 +99,25 @@ def limited(env, steps):
     """An environment that says how long its episodes are, as those of `gym.make` do."""
     env.spec = gym.envs.registration.EnvSpec("Clock-v0", max_episode_steps=steps)
     return env
+
+
+@pytest.mark.parametrize(
+    ("wrap", "limit"),
+    [
+        (lambda env: TimeLimit(env, 90), 90),
+        (lambda env: RepeatAction(TimeLimit(env, 90), 4), 23),  # 22 repeats, and 2 steps
+        (lambda env: TimeLimit(RepeatAction(env, 4), 90), 90),
+        (lambda env: TimeLimit(RepeatAction(TimeLimit(env, 90), 4), 20), 20),
+        (lambda env: RepeatAction(TimeLimit(RepeatAction(env, 2), 90), 3), 30),
+        (lambda env: RepeatAction(limited(env, 90), 4), 23),
+        (lambda env: MaxAndSkipEnv(TimeLimit(env, 90), 3), 30),
+        (lambda env: RepeatAction(env, 4), None),
+    ],
+)
+@pytest.mark.parametrize("vector", [DummyVecEnv, SyncVectorEnv])
+def test_an_action_repeat_outside_of_a_time_limit_divides_it(vector, wrap, limit):
+    env = as_vec_env(vector([lambda: wrap(ClockEnv(ENDLESS))]))
+    assert time_limit(env) == limit
 
 
 def drqv2():

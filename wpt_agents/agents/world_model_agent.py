@@ -29,7 +29,7 @@ from wpt_agents.model.policy import WPTPolicy
 from wpt_agents.model.prior_policy import PriorPolicy
 from wpt_agents.model.sizes import find_size
 from wpt_agents.training.checks import check_dataset, check_trajectory
-from wpt_agents.training.environments import time_limit
+from wpt_agents.training.ends import time_limit
 from wpt_agents.training.hyperparameters import Hyperparameters
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.model_files import WORLD_MODEL, write_world_model

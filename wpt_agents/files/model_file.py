@@ -70,6 +70,14 @@ def agent_of(path: str | os.PathLike[str]) -> str | None:
         return None
 
 
+def is_of_sb3(path: str | os.PathLike[str]) -> bool:
+    """Return whether Stable-Baselines3 itself wrote a file, for one of its own algorithms."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "_stable_baselines3_version" in archive.namelist()
+
+
 def read_header(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the JSON of a model file without reading or verifying its tensors."""
     with zipfile.ZipFile(path) as archive:

@@ -1,7 +1,7 @@
 """What an agent accepts as an environment, made into a VecEnv of Stable-Baselines3."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from importlib import import_module
 from typing import Any
@@ -243,43 +243,3 @@ def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
             stacklevel=4,
         )
     return images[0] if images else None
-
-
-# ----------------------------------------------------------------------- the end of an episode
-
-
-def time_limit(env: VecEnv | None) -> int | None:
-    """Return the steps after which the environment ends an episode, if it says so."""
-    assert env is not None
-    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
-    return getattr(spec, "max_episode_steps", None)
-
-
-def last_observation(
-    env: VecEnv | None, infos: Sequence[Mapping[str, Any]], i: int, first: np.ndarray
-) -> np.ndarray:
-    """Return the last observation of environment i, from before the VecEnv reset it.
-
-    Stable-Baselines3 names it `terminal_observation`, Gymnasium `final_obs`, before 1.0
-    `final_observation`.
-
-    :param first: the first observation after the reset; if both are equal, a warning says so
-    :raises ValueError: the info lacks it
-    """
-    names = ("terminal_observation", "final_obs", "final_observation")
-    last = next((infos[i][name] for name in names if infos[i].get(name) is not None), None)
-    if last is None:
-        raise ValueError(
-            f"Environment {i} of the {type(env).__name__} ended an episode without its last "
-            "observation: a VecEnv puts it into infos[i]['terminal_observation'] before it resets, "
-            "as DummyVecEnv of Stable-Baselines3 does"
-        )
-    if not isinstance(innermost(env), DummyVecEnv) and np.array_equal(last, first):
-        warnings.warn(
-            f"Environment {i} showed the same image at the end of an episode and at the start of "
-            "the next. If it draws all images into one array, the last image is lost: let it "
-            "return observation.copy(), as the agent cannot copy in another process",
-            stacklevel=2,
-        )
-    observation: np.ndarray = last
-    return observation

@@ -5,7 +5,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, Self
 
-from wpt_agents.training.environments import time_limit
+from wpt_agents.training.ends import time_limit
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Collecting: the open episodes of several environments, and who decides on the actions."""
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -11,7 +12,8 @@ from torch import Generator
 
 from wpt_agents.data.trajectory import Trajectory
 from wpt_agents.model.observations import State, stack_frames, to_images
-from wpt_agents.training.environments import innermost, last_observation
+from wpt_agents.training.ends import last_observation
+from wpt_agents.training.environments import innermost
 
 PATIENCE = 1800.0  # seconds that a worker process may take for a step; people may reset robots
 GO_ON = (
@@ -19,6 +21,8 @@ GO_ON = (
     "learn(..., reset_num_timesteps=False)"
 )
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
+WHOLE: Window = (0, sys.maxsize)  # of the warm-up: the whole episode, however long it lasts
+WARM_UP, LATER = "warm-up", "after the warm-up"  # the sources of collected trajectories
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 
@@ -154,6 +158,7 @@ class Rollout:
             np.array(self.rewards[i], np.float32),
             terminated,
             embodiment=self.embodiment,
+            source=WARM_UP if self.windows[i] == WHOLE else LATER,
         )
         self.images[i] = []
         self.actions[i] = []

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -45,15 +46,23 @@ class Line:
     policy: str = ""
 
     @property
-    def run(self) -> Identity:
-        """The identity of the line."""
-        return self.task, self.method, str(self.preset), self.frames, self.seed
+    def run_method(self) -> str:
+        """The method of the run, which for most policies is in their names."""
+        named = re.search(r"--method (\S+)", self.command)  # of "prior actor" it is only there
+        name = self.method.removeprefix(f"{PRIOR_ACTOR}, ").split(",")[0]
+        return named[1] if named else name
 
     @property
-    def agent(self) -> Identity:
-        """The identity of the agent, which is the same for "wpt" and "wpt, last"."""
-        clone = self.method.startswith(PRIOR_ACTOR)  # "prior actor, no-pretrain" is another one
-        method = self.method if clone else self.method.split(",")[0]
+    def identity(self) -> Identity:
+        """The identity of the line; the prior actors of two methods may have the same name."""
+        clone = self.method.startswith(PRIOR_ACTOR)
+        method = f"{PRIOR_ACTOR}, {self.run_method}" if clone else self.method
+        return self.task, method, str(self.preset), self.frames, self.seed
+
+    @property
+    def run(self) -> Identity:
+        """The identity of the run; an untrained policy, which all methods share, has its own."""
+        method = self.run_method if self.frames else self.method
         return self.task, method, str(self.preset), self.frames, self.seed
 
 

@@ -49,8 +49,3 @@ def check_new(identity: object, folder: Path, seen: dict[object, Path]) -> None:
             "delete one of them"
         )
     seen[identity] = folder
-
-
-def read_results(folder: Path) -> list[Result]:
-    """Return the results of `find_results`."""
-    return list(find_results(folder).values())

@@ -1,7 +1,7 @@
 """Seeded copies of a task, whose episodes do not depend on those before them."""
 
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,13 @@ import wpt_envs
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+Wrap = Callable[[VecEnv], VecEnv]
 EPISODE = 2  # distinguishes these seeds from those of `plan.runs.EVALUATION`
+
+
+def unwrapped(venv: VecEnv) -> VecEnv:
+    """Return the environments themselves, for agents that need no wrapper."""
+    return venv
 
 
 class EpisodeSeeds(gym.Wrapper):

@@ -70,6 +70,15 @@ def test_every_command_has_help(command, monkeypatch, capsys):
     assert "Usage" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("suite", "preset"), [("dmc", "demo"), ("robotics", "tiny")])
+def test_every_suite_runs_without_the_name_of_a_preset(
+    suite, preset, monkeypatch, capsys, tmp_path
+):
+    words = ["run", "--suite", suite, "--dry-run", "--out", tmp_path]
+    assert call(monkeypatch, *words) == 0
+    assert f"/{preset}/wpt/" in "".join(capsys.readouterr().out.split())
+
+
 def test_the_list_shows_tasks_presets_and_methods(monkeypatch, capsys):
     assert call(monkeypatch, "list", "--suite", "dmc") == 0
     printed = capsys.readouterr().out

@@ -89,6 +89,16 @@ def test_eval_and_enjoy_show_the_policy(moved, monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "eval", model, *words) == 0
 
 
+@pytest.mark.parametrize("words", [[], ["--task", "dmc-walker-run"]])
+def test_a_file_of_sb3_without_its_run_says_what_is_missing(words, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "model.zip"
+    METHODS["sac"].agent("MlpPolicy", "Pendulum-v1", buffer_size=1).save(file)
+    assert call(monkeypatch, "eval", file, *words) == 2
+    printed = capsys.readouterr().err
+    assert "config.yaml of its run, which does, is not beside it: copy it there" in printed
+    assert "damaged" not in printed and "add --task" not in printed
+
+
 def test_eval_names_the_initial_states_where_a_policy_fails(moved, monkeypatch, capsys):
     folder, *_ = moved
     score = Score((1.0, 2.0, 3.0), (False, True, False))

@@ -312,7 +312,7 @@ def test_every_method_is_built_from_the_small_presets(method, tmp_path):
         [run] = plan(suite, [TASK_OF[suite]], preset, tmp_path, method)
         actions = spaces.Box(-1.0, 1.0, (run.task.action_dim,), np.float32)
         with closing(DummyVecEnv([lambda box=actions: Still(box)])) as venv:
-            wrapped = run.algorithm.wrap(venv) if run.algorithm.wrap else venv
+            wrapped = run.algorithm.wrap(venv)
             agent = make_agent(run, wrapped, None, None)
             action, _ = agent.predict(wrapped.reset(), deterministic=True)
         assert action.shape == (1, run.task.action_dim), (suite, preset)

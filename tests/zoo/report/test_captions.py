@@ -4,14 +4,13 @@ import re
 
 import numpy as np
 import pytest
-from run_folders import make_run
+from run_folders import make_run, write_page
 from test_page import text
 
 from wpt_agents.zoo import numbers
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import sections
 from wpt_agents.zoo.report.names import MEANINGS
-from wpt_agents.zoo.report.page import write_page
 
 
 @pytest.fixture

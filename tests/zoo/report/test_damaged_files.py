@@ -4,14 +4,13 @@ import json
 import warnings
 
 import pytest
-from run_folders import make_run
+from run_folders import make_run, write_page
 from test_figure4 import TASKS, make_sequence
 from test_page import text
 from zoo_command import call
 
 from wpt_agents.zoo.report.figure4 import figures_4, find_sequences
 from wpt_agents.zoo.report.folders import find_finished
-from wpt_agents.zoo.report.page import write_page
 
 ALL = ("evaluations.npz", "result.json", "system.json", "predictions.png", "retrieval.png")
 

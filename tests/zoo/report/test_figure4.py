@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from run_folders import write_page
 from test_page import read, text
 from zoo_command import call
 
 from wpt_agents.zoo.report.figure4 import figures_4, find_sequences
-from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.result import Score, Variant
 from wpt_agents.zoo.sequence_result import Row, SequenceResult, write_sequence
 

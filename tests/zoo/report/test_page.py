@@ -7,15 +7,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from run_folders import make_run
+from run_folders import make_run, write_page
 
 from wpt_agents.zoo.plan.methods import METHODS
 from wpt_agents.zoo.report import aggregates, figures, headline
 from wpt_agents.zoo.report.aggregates import misprint, references
 from wpt_agents.zoo.report.folders import find_finished
-from wpt_agents.zoo.report.page import write_page
 from wpt_agents.zoo.report.paper_tables import Cell, TableRow, shared_note, without_notes
-from wpt_agents.zoo.results import read_results
+from wpt_agents.zoo.results import find_results
 
 
 def make_runs(folder):
@@ -264,7 +263,7 @@ def test_the_headline_compares_successes_where_they_are_the_score(tmp_path):
     for seed in range(3):  # 4.9 and less is no success
         make_run(tmp_path, "metaworld-reach", seed, "wpt", (4.9 - seed / 100, 4.9))
         make_run(tmp_path, "metaworld-reach", seed, "scratch", (0.0, 5.1 + seed / 100))
-    [line] = headline.headlines(read_results(tmp_path))
+    [line] = headline.headlines(list(find_results(tmp_path).values()))
     against = {rival.policy: (rival.above, rival.below) for rival in line.against}
     assert against == {"random policy": (0, 0), "prior actor": (0, 0), "same, from scratch": (0, 1)}
 
@@ -273,7 +272,7 @@ def test_both_suites_are_told_of_at_their_least_budget(tmp_path):
     make_run(tmp_path / "a", "metaworld-reach", returns=(9.0, 1.0))
     make_run(tmp_path / "b", "dmc-walker-run", returns=(100.0, 100.0), frames=1000)
     make_run(tmp_path / "c", "dmc-walker-run", returns=(900.0, 900.0), frames=4000)
-    [line] = headline.both_suites(read_results(tmp_path))
+    [line] = headline.both_suites(list(find_results(tmp_path).values()))
     assert line.ours == pytest.approx((0.5 + 0.1) / 2)
 
 
@@ -287,7 +286,7 @@ def further(tmp_path):
 
 
 def test_the_papers_means_stand_beside_ours_over_the_same_tasks(further):
-    [line] = headline.both_suites(read_results(further))
+    [line] = headline.both_suites(list(find_results(further).values()))
     assert line.ours == pytest.approx((0.73 + 0.5) / 2)
     write_page(further, further / "index.html")
     page = (further / "index.html").read_text()
@@ -302,7 +301,7 @@ def test_a_task_without_a_score_of_the_method_in_the_paper_is_left_out_of_both_m
     make_run(tmp_path, "dmc-walker-run", method="drq-v2", returns=(143.0, 143.0))
     make_run(tmp_path, "metaworld-reach", method="drq-v2", returns=(1.0, 1.0))  # 0.43 in Table 4
     make_run(tmp_path, "metaworld-door-close", method="drq-v2", returns=(9.0, 9.0))  # a dash
-    [line] = headline.both_suites(read_results(tmp_path))
+    [line] = headline.both_suites(list(find_results(tmp_path).values()))
     assert line.ours == pytest.approx((0.143 + 0.0) / 2)
     assert line.paper == pytest.approx((0.143 + 0.43) / 2)
 

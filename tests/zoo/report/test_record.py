@@ -130,6 +130,26 @@ def test_policies_that_a_run_no_longer_has_are_dropped_when_it_is_recorded_again
     }
 
 
+def test_every_method_keeps_its_own_prior_actor_and_tables_show_that_of_wpt(tmp_path):
+    path = tmp_path / "small.csv"
+    for method, score in (("wpt", 1.0), ("wpt+", 2.0), ("kickstart", 3.0), ("wpt", 4.0)):
+        command = f"python -m wpt_agents.zoo run --method {method} --seeds 0-0"
+        names = method, "prior actor"
+        record.update(path, [replace(line(name, score), command=command) for name in names])
+    clones = [one for one in record.read(path) if one.method == "prior actor"]
+    assert [(one.run_method, one.score) for one in clones] == [
+        *[("wpt", 4.0), ("kickstart", 3.0), ("wpt+", 2.0)]
+    ]
+    [seen] = [one for one in record.shown(record.read(path)) if one.method == "prior actor"]
+    assert seen.score == 4.0
+
+
+@pytest.mark.parametrize("name", ["baselines", "mid", "small-benchmark", "tried"])
+def test_every_line_of_the_records_is_shown(name):
+    lines = record.read(Path(__file__).parents[3] / "zoo" / "results" / f"{name}.csv")
+    assert record.shown(lines) == lines
+
+
 def test_a_score_of_another_commit_or_model_is_not_replaced_silently(tmp_path):
     path = tmp_path / "small.csv"
     first = [replace(line("wpt", 1.0), return_=10.0, model_hash="m1"), line("wpt", 2.0, seed=1)]
@@ -172,7 +192,7 @@ def test_a_run_is_recorded_once_however_its_settings_were_written(tmp_path):
 
 def test_presets_are_kept_apart():
     lines = [line("wpt", 40.0), line("wpt", 90.0, preset="small"), line("scratch", 5.0)]
-    assert len({entry.run for entry in lines}) == 3
+    assert len({entry.identity for entry in lines}) == 3
     assert set(record_tables.by_suite(lines)) == {"wpt", "wpt, tiny", "scratch, tiny"}
     assert "| dmc-a | wpt | small | 100 | 90.0 | 90.0 | 0.00 |" in record_tables.markdown(lines)
 

@@ -12,7 +12,7 @@ from run_folders import make_run
 from wpt_agents.zoo.numbers import interval_text
 from wpt_agents.zoo.report import tables
 from wpt_agents.zoo.result import Result, Score, Variant, write_result
-from wpt_agents.zoo.results import read_results
+from wpt_agents.zoo.results import find_results
 
 
 def fake_result(seed, mean, method="wpt", frames=150_000, untrained=()):
@@ -26,7 +26,7 @@ def test_the_report_is_the_mean_over_seeds_beside_the_papers_number(tmp_path):
     for seed, mean in enumerate((700.0, 710.0, 720.0)):
         (tmp_path / str(seed)).mkdir()
         write_result(tmp_path / str(seed), fake_result(seed, mean))
-    (row,) = tables.summarise(read_results(tmp_path))
+    (row,) = tables.summarise(find_results(tmp_path).values())
     # sd 10, t 4.303 with two degrees of freedom: 710 -+ 4.303 * 10 / sqrt(3) = 24.8
     assert (row.scores, row.mean, row.paper) == ((700, 710, 720), 710, 728.0)
     assert (row.low, row.high) == pytest.approx((685.2, 734.8), abs=0.1)
@@ -136,4 +136,4 @@ def test_the_same_run_found_twice_is_refused_instead_of_counted_as_two_seeds(tmp
     make_run(tmp_path / "a", "dmc-dot")
     make_run(tmp_path / "b", "dmc-dot")
     with pytest.raises(ValueError, match="are the same run: report one of their folders"):
-        read_results(tmp_path)
+        find_results(tmp_path)

@@ -3,13 +3,12 @@
 import html
 
 import numpy as np
-from run_folders import make_run
+from run_folders import make_run, write_page
 from typer.testing import CliRunner
 
 from wpt_agents.zoo.commands.app import app
 from wpt_agents.zoo.report import steadiness
 from wpt_agents.zoo.report.folders import find_finished
-from wpt_agents.zoo.report.page import write_page
 
 
 def evaluated(folder, returns, successes=None):

@@ -152,7 +152,7 @@ def test_an_engine_records_finished_runs_and_reports_one_that_it_could_not_recor
     finish(first)
     monkeypatch.setattr(Local, "map", lambda *_: {})
     assert run_on("local", [first], False, Resources())
-    assert {line.run for line in record.read(path)} == {identity_of(first)}
+    assert {line.identity for line in record.read(path)} == {identity_of(first)}
 
     def fail_to_record(_, work, jobs, tick):
         for one in jobs:

@@ -11,7 +11,7 @@ import pytest
 from dot_runs import dot, job  # noqa: F401  (dot registers the task for each test)
 
 from wpt_agents.zoo.result import read_result
-from wpt_agents.zoo.results import read_results
+from wpt_agents.zoo.results import find_results
 from wpt_agents.zoo.run import runner
 
 pytestmark = pytest.mark.slow  # whole runs
@@ -89,7 +89,7 @@ def test_a_benchmark_killed_twice_ends_with_each_run_once_and_finished_ones_unto
         assert (folder / "result.json").stat().st_mtime_ns == when
     whole = [job(tmp_path / "whole", "scratch", seed, **LEARN) for seed in SEEDS]
     assert runner.run_all(whole)
-    assert len(read_results(tmp_path / "runs")) == len(SEEDS)
+    assert len(find_results(tmp_path / "runs")) == len(SEEDS)
     for one, other in zip(broken, whole, strict=True):
         assert untimed(read_result(one.folder)) == untimed(read_result(other.folder))
 
@@ -128,4 +128,4 @@ def test_a_run_that_always_fails_leaves_the_others_and_is_named_with_its_log(
     said = capsys.readouterr().out
     assert [read_result(one.folder) is not None for one in jobs] == [True, False, True]
     assert "out of luck" in said and "error.txt" in said
-    assert len(read_results(tmp_path)) == 2  # means are over two, and their number is shown
+    assert len(find_results(tmp_path)) == 2  # means are over two, and their number is shown

@@ -16,6 +16,13 @@ retrieve = typer.Typer(no_args_is_help=True, help=HELP)
 
 
 Picture = Annotated[Path, typer.Option(help="The file of the picture.")]
+Encoder = Annotated[
+    str,
+    typer.Option(
+        help="The model whose encoder compares the images: a file, the folder of a run or of a "
+        "pre-training, or the name of a shipped model."
+    ),
+]
 TaskRendering = Annotated[
     Rendering | None,
     typer.Option(
@@ -28,13 +35,7 @@ TaskRendering = Annotated[
 
 def show_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset.")],
-    model: Annotated[
-        str,
-        typer.Option(
-            help="The model whose encoder compares the images: a file, the folder of a run or of a "
-            "pre-training, or the name of a shipped model."
-        ),
-    ],
+    model: Encoder,
     query: Annotated[
         list[int],
         typer.Option(help="Numbers of trajectories whose first images are the queries."),
@@ -82,13 +83,7 @@ def show_retrieval(
 
 def share_retrieval(
     folder: Annotated[Path, typer.Argument(help="The folder of a dataset that names its tasks.")],
-    model: Annotated[
-        str,
-        typer.Option(
-            help="The model whose encoder compares the images: a file, the folder of a run or of a "
-            "pre-training, or the name of a shipped model."
-        ),
-    ],
+    model: Encoder,
     task: Annotated[list[str], typer.Option(help="Tasks whose first images are the queries.")],
     suite: Suite = "metaworld",
     rendering: TaskRendering = None,

@@ -9,9 +9,10 @@ import typer
 from wpt_agents.zoo.commands.options import Device, Settings, Suite, Tasks, Workers
 
 PresetName = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="A named set of settings: debug, demo, tiny, mid, small, medium or paper (zoo/*.yaml)."
+        help="A named set of settings: debug, demo, tiny, mid, small, medium or paper "
+        "(zoo/*.yaml); by default demo, or tiny if the suite has no demo."
     ),
 ]
 Out = Annotated[
@@ -138,7 +139,7 @@ def list_tasks(
 
 def pretrain_model(
     suite: Suite = "dmc",
-    preset: PresetName = "demo",
+    preset: PresetName = None,
     data: Data = None,
     settings: Settings = [],  # noqa: B006
     out: Out = Path("runs"),
@@ -173,14 +174,14 @@ def pretrain_model(
     from wpt_agents.zoo.plan.checks import check_pretraining
     from wpt_agents.zoo.plan.effects import check_effects, from_given
     from wpt_agents.zoo.plan.methods import METHODS
-    from wpt_agents.zoo.plan.presets import load_preset
+    from wpt_agents.zoo.plan.presets import default_preset, load_preset
     from wpt_agents.zoo.plan.shared import Shared
     from wpt_agents.zoo.result import Change
     from wpt_agents.zoo.run.shared import collect_data, pretrain
     from wpt_agents.zoo.terminal import console
 
     check_device(device)
-    chosen = load_preset(suite, preset, settings)
+    chosen = load_preset(suite, preset or default_preset(suite), settings)
     if chosen.pretrain.model:
         raise ValueError(f"Nothing to pre-train: {from_given(chosen)}")
     check_effects([Change.parse(text).short for text in settings], METHODS, chosen, data)
@@ -203,7 +204,7 @@ def run_benchmark(
     suite: Suite = "dmc",
     tasks: Tasks = [],  # noqa: B006
     sequence: SequenceName = "",
-    preset: PresetName = "demo",
+    preset: PresetName = None,
     seeds: Seeds = "1",
     method: MethodNames = ["wpt"],  # noqa: B006
     frames: Frames = None,
@@ -238,7 +239,7 @@ def run_benchmark(
     from dataclasses import replace
 
     from wpt_agents.training.distributed import started_by_torchrun
-    from wpt_agents.zoo.plan.presets import load_preset
+    from wpt_agents.zoo.plan.presets import default_preset, load_preset
     from wpt_agents.zoo.plan.request import Request
     from wpt_agents.zoo.plan.runs import make_plan
     from wpt_agents.zoo.plan.sequences import find_sequence, make_sequences
@@ -250,6 +251,7 @@ def run_benchmark(
         raise ValueError("torchrun is for `pretrain`: pre-train with it, then `run` without it")
     changes = [*settings, *([f"learn.frames={frames}"] if frames is not None else [])]
     preset_suite = find_sequence(sequence).suite if sequence else suite
+    preset = preset or default_preset(preset_suite)
     if from_nothing and load_preset(preset_suite, preset).pretrain.model:
         changes.append("pretrain.model=")
     request = Request(preset, seeds, method, changes, out, workers, device, data)

@@ -1,7 +1,7 @@
 """Evaluate a policy: its returns over seeded episodes, and a video of one of them."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
@@ -19,9 +19,7 @@ from wpt_agents.zoo.collect.policies import executed
 from wpt_agents.zoo.judge.untrained import State
 from wpt_agents.zoo.result import Score
 from wpt_agents.zoo.terminal import progress
-from wpt_agents.zoo.vec_envs import make_vec_env
-
-Wrap = Callable[[VecEnv], VecEnv]
+from wpt_agents.zoo.vec_envs import Wrap, make_vec_env, unwrapped
 
 PARALLEL = 50  # simulators at once in an evaluation, to bound the memory
 
@@ -41,7 +39,7 @@ def evaluate(
     episodes: int,
     seed: int,
     label: str = "",
-    wrap: Wrap | None = None,
+    wrap: Wrap = unwrapped,
 ) -> Score:
     """Play `episodes` episodes, up to `PARALLEL` at once, each with its own seed.
 
@@ -72,7 +70,7 @@ def evaluate(
             ended.clear()
             number = min(PARALLEL, episodes - first)
             venv = make_vec_env(task, env, seed + first, number)
-            with closing(wrap(venv) if wrap else venv) as wrapped:
+            with closing(wrap(venv)) as wrapped:
                 earned, _ = evaluate_policy(
                     policy, wrapped, number, callback=watch, return_episode_rewards=True
                 )
@@ -128,7 +126,7 @@ def film(
     env: Mapping[str, Any],
     seed: int,
     size: int = 256,
-    wrap: Wrap | None = None,
+    wrap: Wrap = unwrapped,
 ) -> tuple[Trajectory, list[np.ndarray], float]:
     """Play one episode and render it.
 
@@ -142,7 +140,7 @@ def film(
     frames: list[np.ndarray] = []
     actions: list[np.ndarray] = []
     rewards: list[float] = []
-    with closing(wrap(single) if wrap else single) as venv:
+    with closing(wrap(single)) as venv:
         assert isinstance(venv.action_space, spaces.Box)
         venv.seed(seed)
         obs: Any = venv.reset()

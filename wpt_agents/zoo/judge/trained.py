@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_envs.tasks import TASKS
 
 from wpt_agents.agents.wpt import WPT
-from wpt_agents.files.model_file import agent_of
+from wpt_agents.files.model_file import agent_of, is_of_sb3
 from wpt_agents.files.names import unknown_name
 from wpt_agents.zoo.judge.evaluation import NoisyPolicy, evaluate, film
 from wpt_agents.zoo.judge.prediction import CONTEXT
@@ -141,10 +141,9 @@ def find_trained(path: Path, task: str = "") -> Trained:
         raise FileNotFoundError(f"There is no {path}; name a run folder or a model file (.zip)")
     folder = path if path.is_dir() else path.parent
     model = final_model(path) if path.is_dir() else path
-    origin = read_origin(folder)
-    if origin is None and not task:
+    origin = read_origin(folder) or Origin("", method=_method_of(model))
+    if not (task or origin.task):
         raise ValueError(f"{folder} has no config.yaml to say what {model.name} is for: add --task")
-    origin = origin or Origin("", method=_method_of(model))
     rows = find_tasks("dmc", [task]) if task else []
     if len(rows) > 1:
         raise ValueError(f"--task {task} matches {len(rows)} tasks: name one as `list` shows it")
@@ -186,7 +185,16 @@ class Origin:
 
 
 def _method_of(model: Path) -> str:
-    """Return a method whose agent wrote a model file, "wpt" if the file does not say it."""
+    """Return a method whose agent wrote a model file, "wpt" if the file does not say it.
+
+    :raises ValueError: if Stable-Baselines3 wrote the file, which does not name the algorithm
+    """
+    if is_of_sb3(model):
+        raise ValueError(
+            f"{model} was saved by Stable-Baselines3 and does not name its algorithm, and the "
+            "config.yaml of its run, which does, is not beside it: copy it there, or name the run "
+            "folder"
+        )
     kind = agent_of(model)
     return next((name for name, row in METHODS.items() if row.agent.__name__ == kind), "wpt")
 

@@ -18,7 +18,7 @@ with `episodes`, without which a killed run restarts instead of resuming.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -35,6 +35,7 @@ from wpt_agents.agents.r3m import R3M
 from wpt_agents.agents.rlpd import RLPD
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import unknown_name
+from wpt_agents.zoo.vec_envs import Wrap, unwrapped
 
 # Keywords that the stages pass to an agent, so presets must not set them.
 RESERVED = {
@@ -87,7 +88,7 @@ class Method:
     needs_data: bool = True
     shared: tuple[str, ...] | None = None
     policy: str = "WPTPolicy"
-    wrap: Callable[[VecEnv], VecEnv] | None = None
+    wrap: Wrap = unwrapped
     plus: bool = False
 
     @property

@@ -25,7 +25,7 @@ def show_plan(jobs: Sequence[Run], force: bool) -> None:
     table = Table("task", "method", "seed", "env steps", "updates", "state", "folder")
     record = jobs[0].record
     lines = read(record) if record is not None and record.exists() else []
-    recorded = {line.run for line in lines} & set(map(identity_of, jobs))
+    recorded = {line.identity for line in lines} & set(map(identity_of, jobs))
     for job in jobs:
         state = "finished" if is_finished(job) and not force else "to do"
         if identity_of(job) in recorded:

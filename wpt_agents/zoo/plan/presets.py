@@ -244,6 +244,11 @@ def preset_names(suite: str) -> list[str]:
     return list(_read_suite(suite).presets)
 
 
+def default_preset(suite: str) -> str:
+    """Return the preset of a suite's runs if the user names none."""
+    return "demo" if "demo" in preset_names(suite) else "tiny"
+
+
 class SuiteFile(NamedTuple):
     """The content of zoo/<suite>.yaml."""
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 
 import jinja2
 import yaml
@@ -13,18 +12,17 @@ from wpt_agents.zoo import numbers
 from wpt_agents.zoo.report import (
     aggregates,
     figure2,
-    figure4,
     headline,
     paper_tables,
     sections,
     steadiness,
     tables,
 )
-from wpt_agents.zoo.report.folders import Finished, Unfinished, find_finished, find_unfinished
+from wpt_agents.zoo.report.figure4 import Figure4
+from wpt_agents.zoo.report.folders import Finished, Unfinished
 from wpt_agents.zoo.report.names import MEANINGS, policy_name, policy_title
 from wpt_agents.zoo.report.sections import Names
 from wpt_agents.zoo.result import Result, Score, Variant
-from wpt_agents.zoo.text_files import write_atomically
 
 MEDIA = ("first", "all", "none")
 
@@ -35,28 +33,17 @@ def check_media(media: str) -> None:
         raise unknown_name("choice of media", media, MEDIA)
 
 
-def write_page(
-    folder: Path, path: Path, media: str = "first", runs: Sequence[Finished] | None = None
-) -> None:
-    """Write the page about all runs below `folder` to `path` atomically.
-
-    :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
-        seed of its best-known method), or of "none"; they make up most of the page's size
-    :param runs: the finished runs, if they have been read already
-    """
-    check_media(media)
-    sequences = figure4.find_sequences(folder)
-    runs = find_finished(folder) if runs is None else runs
-    write_atomically(path, render(runs, find_unfinished(folder), media, sequences))
-
-
 def render(
     runs: Sequence[Finished],
     unfinished: Sequence[Unfinished],
+    sequences: Sequence[Figure4],
     media: str = "first",
-    sequences: Sequence[figure4.SequenceFolder] = (),
 ) -> str:
-    """Return the page's HTML."""
+    """Return the page's HTML.
+
+    :param media: show videos and pictures of "all" runs, of the "first" run of each task (the first
+        seed of its best-known method), or of "none"; they make up most of the page's size
+    """
     loader = jinja2.PackageLoader("wpt_agents.zoo.report", ".")
     env = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     env.filters |= {
@@ -69,7 +56,7 @@ def render(
     runs = sorted(runs, key=_order)
     names = Names(run.experiment for run in runs)
     results = [run.result for run in runs]
-    methods = {result.method for result in results} | {result.method for _, result in sequences}
+    methods = {result.method for result in results}.union(*(one.names for one in sequences))
     return env.get_template("page.html.jinja").render(
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         suites=[
@@ -77,7 +64,7 @@ def render(
             for suite in dict.fromkeys(result.suite for result in results)
         ],
         figure_2=figure2.figure_2(runs, names),
-        figures_4=figure4.figures_4(sequences),
+        figures_4=sequences,
         tables=paper_tables.paper_tables(runs, names),
         policies=tables.by_task(tables.policies(results)),
         policy_cells=tables.policy_cells,

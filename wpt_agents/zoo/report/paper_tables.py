@@ -10,7 +10,7 @@ from wpt_agents.zoo.numbers import POSSIBLE, evidence_text, seeds_text
 from wpt_agents.zoo.report import aggregates
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, STATISTICS, Reference
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.sections import BASELINES, Names
+from wpt_agents.zoo.report.sections import PRINTED, Names
 from wpt_agents.zoo.statistics import mean_interval
 
 OFFICIAL = {  # published by the authors of these methods, on eight tasks of Table 5
@@ -18,7 +18,7 @@ OFFICIAL = {  # published by the authors of these methods, on eight tasks of Tab
     "drq-v2-official": "DrQ-v2, by its authors",
     "mrq-official": "MR.Q, by its authors",
 }
-COLUMNS = BASELINES | OFFICIAL
+COLUMNS = PRINTED | OFFICIAL
 OURS_PER_TABLE = 6  # of our columns; with the paper's they fit into a window of 1,440 pixels
 TITLES = {3: "Meta-World", 4: "Meta-World, continued", 5: "DMControl"}
 
@@ -108,7 +108,7 @@ def paper_table(
     rows = {task: table_row(task, printed, columns, ours, cells) for task in tasks}
     run_rows = [row for task, row in rows.items() if task in shown]
     notes = [shared_note(run_rows, place) for place in range(len(ours))]
-    near = [i for i, (method, n) in enumerate(columns) if n == PAPER_BUDGET and method in BASELINES]
+    near = [i for i, (method, n) in enumerate(columns) if n == PAPER_BUDGET and method in PRINTED]
     return PaperTable(
         number=number,
         title=TITLES[number],

@@ -54,6 +54,7 @@ def renew(record: Path) -> None:
 
 def write(record: Path, lines: Sequence[Line]) -> None:
     """Write the tables and the pictures of a record beside it."""
+    lines = records.shown(lines)
     write_atomically(record.with_suffix(".md"), markdown(lines))
     record_picture.draw(record.with_suffix(".png"), lines)
     record_curves.draw(record, record_curves.read(record), lines)

@@ -16,7 +16,7 @@ from wpt_agents.zoo.report.headline import OURS, SUITES
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
-BASELINES = {  # of the paper's tables
+PRINTED = {  # the methods of the paper's tables, among them WPT
     "dreamer-v3": "DreamerV3",
     "drq-v2": "DrQ-v2",
     "wpt": "WPT",
@@ -140,7 +140,7 @@ def method_row(one: Experiment, tasks: Scores, names: Names) -> MethodRow:
 def paper_rows(suite: str, tasks: set[str]) -> list[PaperRow]:
     """Return the aggregates of the paper's baselines over the tasks that were run."""
     rows = []
-    for method, name in BASELINES.items():
+    for method, name in PRINTED.items():
         aggregate = aggregates.paper_aggregate(suite, tasks, method, PAPER_BUDGET)
         if method != OURS and aggregate is not None:
             rows.append(PaperRow(name, aggregate))

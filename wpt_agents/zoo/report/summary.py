@@ -15,11 +15,12 @@ from wpt_agents.zoo.report.figure4 import (
 )
 from wpt_agents.zoo.report.folders import (
     Finished,
+    Unfinished,
     find_finished,
     find_unfinished,
     unfinished_text,
 )
-from wpt_agents.zoo.report.page import write_page
+from wpt_agents.zoo.report.page import render
 from wpt_agents.zoo.terminal import console
 from wpt_agents.zoo.text_files import write_atomically
 
@@ -31,16 +32,14 @@ class Summary:
     :param rows: a row for each task and method
     :param policies: a row for each task and policy
     :param steady: how much the policies change from evaluation to evaluation
-    :param missing: a paragraph that names unfinished and failed runs, "" without any
     """
 
-    folder: Path
     runs: Sequence[Finished]
+    unfinished: Sequence[Unfinished]
     sequences: Sequence[Figure4]
     rows: Sequence[tables.Row]
     policies: Sequence[tables.PolicyRow]
     steady: Sequence[steadiness.Steadiness]
-    missing: str
 
     @classmethod
     def of(cls, folder: Path) -> Self:
@@ -51,14 +50,18 @@ class Summary:
         runs = find_finished(folder)
         results = [run.result for run in runs]
         return cls(
-            folder,
             runs,
+            find_unfinished(folder),
             figures_4(find_sequences(folder)),
             tables.summarise(results),
             tables.policies(results),
             steadiness.steadiness(runs),
-            unfinished_text(find_unfinished(folder)),
         )
+
+    @property
+    def missing(self) -> str:
+        """A paragraph that names unfinished and failed runs, "" without any."""
+        return unfinished_text(self.unfinished)
 
     def markdown(self) -> str:
         """Return all tables as Markdown."""
@@ -75,9 +78,9 @@ class Summary:
     def write(self, page: Path, media: str) -> None:
         """Write the page, and Markdown and CSV files beside it.
 
-        :param media: as `write_page` takes it
+        :param media: as `render` takes it
         """
-        write_page(self.folder, page, media, self.runs)
+        write_atomically(page, render(self.runs, self.unfinished, self.sequences, media))
         write_atomically(page.with_name("report.md"), self.markdown())
         write_atomically(page.with_name("policies.csv"), self.csv())
 

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.files.names import counted
 from wpt_agents.zoo.judge.evaluation import evaluate, film
+from wpt_agents.zoo.judge.prediction import CONTEXT, HORIZON
 from wpt_agents.zoo.judge.trained import actor_alone
 from wpt_agents.zoo.judge.untrained import BASELINES
 from wpt_agents.zoo.learning_curves import EVALUATIONS, MONITOR, Evaluations, TrainingEpisodes
@@ -21,9 +22,6 @@ from wpt_agents.zoo.run.checkpoints import BEST_MODEL, HEAD_START_MODEL, checksu
 from wpt_agents.zoo.run.shared import play_untrained
 from wpt_agents.zoo.tasks import short_name
 from wpt_agents.zoo.terminal import say
-
-CONTEXT = 5  # number of images that the world model observes
-HORIZON = 40  # number of images that it then predicts
 
 
 def evaluate_policies(run: Run, agent: BaseAlgorithm) -> dict[str, Score]:

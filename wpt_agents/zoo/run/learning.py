@@ -54,7 +54,7 @@ def make_training_env(run: Run) -> VecEnv:
     overlap = run.preset.learn.overlap and run.keywords.get("train_freq") == "step"
     monitor = str(run.folder / MONITOR)
     venv = make_vec_env(run.task.id, run.shared.env, run.seed, monitor=monitor, workers=overlap)
-    return run.algorithm.wrap(venv) if run.algorithm.wrap else venv
+    return run.algorithm.wrap(venv)
 
 
 def make_agent(
@@ -183,7 +183,7 @@ def evaluations(run: Run) -> Iterator[list[BaseCallback]]:
         yield []
         return
     venv = make_vec_env(run.task.id, run.shared.env, run.evaluation_seed + APART)
-    with closing(run.algorithm.wrap(venv) if run.algorithm.wrap else venv) as wrapped:
+    with closing(run.algorithm.wrap(venv)) as wrapped:
         callback = EvaluationCallback(
             wrapped,
             metric=metric_of(run.task),

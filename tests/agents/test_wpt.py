@@ -594,6 +594,56 @@ def test_the_clones_learning_rate_falls_to_zero(store, monkeypatch):
     assert rates == pytest.approx([0.1, 0.075, 0.05, 0.025])
 
 
+@pytest.mark.parametrize("settings", [{}, {"pixel_weight": 8.0}])
+def test_adapting_makes_updates_of_eq_1_on_the_retrieved_trajectories(store, settings):
+    plain = pretrained(store, env=DotEnv(), **settings).learn(0)
+    adapted = pretrained(store, env=DotEnv(), adapt_steps=3, **settings).learn(0)
+    assert adapted.progress.adapted == 3 and adapted.retrieved_ids == plain.retrieved_ids
+    moved = {name for name, w in weights(plain).items() if (w != weights(adapted)[name]).any()}
+    assert {name.split(".")[1] for name in moved} == {"encoder", "rssm", "decoder"}
+    for number in range(3):  # the same by hand
+        rng = plain.streams.numpy(Purpose.ADAPT, number)
+        rows = plain.retrieved.sample(
+            plain.batch_size, plain.batch_length, plain.max_action_dim, rng, bool(settings)
+        )
+        plain.learner.update_world_model(rows, plain.streams.torch(Purpose.ADAPT, number, "cpu"))
+    assert same(weights(plain), weights(adapted))
+
+
+def test_adapting_goes_on_where_it_was_interrupted_and_begins_again_for_a_new_task(
+    store, monkeypatch
+):
+    whole = pretrained(store, env=DotEnv(), adapt_steps=4).learn(0)
+    model = pretrained(store, env=DotEnv(), adapt_steps=4)
+    update = model.learner.update_world_model
+
+    def interrupted(*args):
+        if model.progress.adapted == 2:
+            raise KeyboardInterrupt
+        return update(*args)
+
+    monkeypatch.setattr(model.learner, "update_world_model", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(0)
+    monkeypatch.undo()
+    model.learn(0)
+    assert same(weights(whole), weights(model))
+    model.learn(0)
+    assert same(weights(whole), weights(model))  # once for a task
+    model.reset_task()
+    assert model.progress.adapted == 0
+    model.learn(0)
+    assert model.progress.adapted == 4
+
+
+def test_adapting_alone_retrieves_and_needs_a_dataset(store):
+    alone = {"adapt_steps": 2, "offline_ratio": 0, "guidance": 0}
+    model = pretrained(store, env=DotEnv(), **alone).learn(0)
+    assert model.retrieved_ids and model.progress.adapted == 2 and model.prior is None
+    with pytest.warns(UserWarning, match="adapt_steps=0"):
+        agent(DotEnv(), **alone).learn(0)
+
+
 def test_learning_in_two_calls_equals_one():
     whole, parts = agent(DotEnv()).learn(4 * LENGTH), agent(DotEnv()).learn(2 * LENGTH)
     parts.learn(2 * LENGTH, reset_num_timesteps=False)

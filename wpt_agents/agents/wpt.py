@@ -41,7 +41,7 @@ from wpt_agents.training.rollout import WARM_UP, Window
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
     "model.prior stays None. Pass dataset= to WPT or load, or pass offline_ratio=0, guidance=0, "
-    "kickstart=0, without ibrl and residual, if this is intended"
+    "kickstart=0, adapt_steps=0, without ibrl and residual, if this is intended"
 )
 
 
@@ -151,7 +151,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Fine-tune on the task (Algorithm 1): retrieve, clone, then collect and update in turns.
 
         :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. With
-            0 there is no step and no update, only retrieval and the training of the prior actor
+            0 there is no step, only what precedes the first one: retrieval, cloning, `adapt_steps`
         :param callback: SB3's callbacks
         :param log_interval: stored episodes between two dumps of the log
         :param tb_log_name: name of the run's folder in `tensorboard_log`
@@ -170,6 +170,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         ):
             self.retrieve(progress_bar)
             self.clone(progress_bar)
+            self.adapt(progress_bar)
             while self.unfinished and self.collect(callback, log_interval):
                 self.update_models()
         return self
@@ -178,7 +179,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
         settings = self.hyperparameters
         progress = self.progress
-        if not (settings.needs_clone or settings.offline_ratio):
+        if not settings.retrieves:
             return
         if self.dataset is None:
             self._warn_without_dataset()
@@ -200,6 +201,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             self.retrieved = None  # drop the old ones now: the reading below may be interrupted
             if outdated and settings.needs_clone:
                 progress.cloned = False  # the prior actor was cloned from the old ones
+            progress.adapted = 0 if outdated else progress.adapted
         retrieved = ReplayBuffer()
         ids = progress.retrieved_ids
         trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
@@ -234,6 +236,22 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.policy.prior_actor.load_state_dict(actor.state_dict())
         self.progress.cloned = True
         self.choose_who_acts()
+
+    def adapt(self, progress_bar: bool = False) -> None:
+        """Train the world model on the retrieved trajectories alone (`adapt_steps`, Eq. 1)."""
+        settings = self.hyperparameters
+        progress = self.progress
+        shape = settings.batch_size, settings.batch_length, settings.max_action_dim
+        left = settings.adapt_steps - progress.adapted
+        if self.retrieved is None or left <= 0:
+            return
+        self.adapt_to_data(self.retrieved)
+        for _ in shown(range(left), left, "adapt", progress_bar):
+            rng = self.streams.numpy(Purpose.ADAPT, progress.adapted)
+            generator = self.streams.torch(Purpose.ADAPT, progress.adapted, self.device)
+            batch = self.retrieved.sample(*shape, rng, settings.marks).to(self.device)
+            self.learner.update_world_model(batch, generator)
+            progress.adapted += 1
 
     # // Collect Data: the loop is `PixelAgent.collect`, which calls these
 
@@ -375,7 +393,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             for trajectory in self.replay_buffer.trajectories:
                 self.kept.add(replace(trajectory, reward=None))
         self.retrieved = None
-        self.progress.reset("retrieved_ids")
+        self.progress.reset("retrieved_ids", "adapted")
         super().reset_task()
 
     def next_task(self, env: GymEnv | str) -> None:

@@ -53,7 +53,12 @@ class ReplayBuffer:
         return self._transitions
 
     def sample(
-        self, batch_size: int, length: int, action_width: int, rng: np.random.Generator
+        self,
+        batch_size: int,
+        length: int,
+        action_width: int,
+        rng: np.random.Generator,
+        mark: bool = False,
     ) -> Batch:
         """Draw a batch by the rule of `wpt_agents.data.windows`.
 
@@ -61,11 +66,12 @@ class ReplayBuffer:
         :param length: T, number of images in a sequence
         :param action_width: A, width to which actions are padded
         :param rng: source of the random numbers
+        :param mark: return a `MarkedBatch`, which marks what moves
         :return: (B, T) sequences
         :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
         """
         rows = self.draw(batch_size, length, rng)
-        return _batch_of(self.trajectories, rows, action_width)
+        return _batch_of(self.trajectories, rows, action_width, mark)
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
         """Draw the pieces that `sample` copies."""

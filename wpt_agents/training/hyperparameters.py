@@ -360,6 +360,12 @@ class Hyperparameters(Keywords):
         "count less. Not in the paper",
         Stage.CLONING,
     )
+    adapt_steps: int = count(
+        0,
+        "number of updates of the world model on the retrieved trajectories alone, before anything "
+        "is collected, so that it represents what they show of the task. Not in the paper",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -401,6 +407,11 @@ class Hyperparameters(Keywords):
     def adapts(self) -> bool:
         """Whether the weight of the imitation goes by the returns."""
         return isinstance(parse_kickstart(self.kickstart), Adaptive)
+
+    @property
+    def retrieves(self) -> bool:
+        """Whether trajectories are retrieved, to be cloned, rehearsed or adapted to."""
+        return bool(self.needs_clone or self.offline_ratio or self.adapt_steps)
 
     @property
     def needs_clone(self) -> bool:

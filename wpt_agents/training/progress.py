@@ -102,7 +102,11 @@ class WPTProgress(WorldModelProgress):
 
     :ivar retrieved_ids: numbers of the retrieved trajectories in the dataset
     :ivar retrieved_of: fingerprint of that dataset
+    :ivar adapted: updates of the world model on the retrieved trajectories alone
     """
+
+    of_weights: ClassVar[tuple[str, ...]] = (*WorldModelProgress.of_weights, "adapted")
 
     retrieved_ids: list[int] = field(default_factory=list)
     retrieved_of: str = ""
+    adapted: int = field(default=0, metadata={"earlier": 0})

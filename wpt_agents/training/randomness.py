@@ -28,6 +28,7 @@ class Purpose(IntEnum):
     REDRAW = 8  # of the networks, for the next task of a sequence
     CONTINUE = 9  # the continue head
     ENSEMBLE = 10  # the further reward heads
+    ADAPT = 11  # of the world model to the retrieved trajectories
     RESET = 100  # of the environment, before an explorer's episode
 
 

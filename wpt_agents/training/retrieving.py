@@ -54,7 +54,7 @@ def retrieve_ids(
         raise ValueError(
             f"The dataset {dataset.path} has no trajectory of {width} actions{whose} to retrieve; "
             f"add some{', set another embodiment' * bool(whose)}, or learn with offline_ratio=0, "
-            "guidance=0, kickstart=0, without ibrl and residual"
+            "guidance=0, kickstart=0, adapt_steps=0, without ibrl and residual"
         )
     return [int(i) for i in numbers]
 

@@ -75,7 +75,7 @@ def why_useless(
 
 
 def trains_none(preset: Preset, methods: Collection[str]) -> bool:
-    """Return whether nothing is pre-trained, because a given model takes its place."""
+    """Return whether nothing is pre-trained, because a pre-trained model takes its place."""
     pretrained = [METHODS[name] for name in methods if METHODS[name].pretrained]
     return bool(preset.pretrain.model) and all(given_for(preset, one.agent) for one in pretrained)
 

@@ -135,7 +135,7 @@ def check_types(agent: type[BaseAlgorithm], values: Mapping[str, Any]) -> None:
 
 
 NO_CLONE = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
-ALONE = {"offline_ratio": 0.0, **NO_CLONE}  # no data except the replay buffer
+ALONE = {"offline_ratio": 0.0, "adapt_steps": 0, **NO_CLONE}  # no data except the replay buffer
 # DreamerV3 from scratch, with the settings of its code for images of DMControl. Differences: its
 # optimiser, norms and pooling, the spacing of its bins, and the critic's regulariser on replayed
 # states are not used. Its returns bootstrap from the critic, ours from the target critic. The

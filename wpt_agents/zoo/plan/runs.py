@@ -121,9 +121,8 @@ class Run:
         if not self.algorithm.needs_data or not issubclass(self.algorithm.agent, WPT):
             return self.algorithm.needs_data
         values = self.full_keywords
-        names = ("guidance", "kickstart", "ibrl", "residual")
-        acting = Hyperparameters.of({name: values[name] for name in names})
-        return bool(values["offline_ratio"]) or acting.needs_clone
+        names = ("guidance", "kickstart", "ibrl", "residual", "offline_ratio", "adapt_steps")
+        return Hyperparameters.of({name: values[name] for name in names}).retrieves
 
     @property
     def updates(self) -> int | None:

@@ -421,7 +421,7 @@ def test_scratch_has_all_of_wpt_plus_but_data_and_prior_actor(suite, task, tmp_p
         plan(suite, [task], "mid", tmp_path, method)[0] for method in ("wpt", "wpt+", "scratch")
     )
     none = {"guidance": 0.0, "kickstart": 0.0, "ibrl": False, "residual": False}
-    assert scratch.keywords == plus.keywords | none | {"offline_ratio": 0.0}
+    assert scratch.keywords == plus.keywords | none | {"offline_ratio": 0.0, "adapt_steps": 0}
     # 1,000 steps earn 1000 * 64 / (16 * 16) = 250 of the head start's 300 updates; 1,500 steps of
     # DMControl earn 1500 * 64 / (16 * 32) = 187.5
     updates = {"metaworld": (1500, 1550), "dmc": (2500, 2612)}

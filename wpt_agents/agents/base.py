@@ -20,7 +20,6 @@ A subclass may also override the methods below `# Hooks`.
 """
 
 import os
-import sys
 import time
 from abc import abstractmethod
 from collections import defaultdict
@@ -45,7 +44,7 @@ from wpt_agents.training.evaluations import showing_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.resets import resets
-from wpt_agents.training.rollout import Rollout, Window, last_images, step_all
+from wpt_agents.training.rollout import WARM_UP, Rollout, Window, last_images, step_all
 
 Metrics = dict[str, list[Tensor]]
 
@@ -263,9 +262,9 @@ class PixelAgent(SavedAgent):
         return self.rollout
 
     def _draw_window(self) -> Window:
-        """Decide at an episode's start whether, and when, the guide acts."""
+        """Decide at a trajectory's start whether, and when, the guide acts."""
         if self.num_timesteps < self.warmup_steps:
-            return 0, sys.maxsize  # the whole episode, however long it lasts
+            return WARM_UP
         self.progress.windows_drawn += 1
         return self.guidance_window(self.streams.numpy(Purpose.WINDOW, self.progress.windows_drawn))
 

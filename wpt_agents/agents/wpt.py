@@ -36,7 +36,7 @@ from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.retrieving import read_retrieved, retrieve_ids, with_kept
-from wpt_agents.training.rollout import Window
+from wpt_agents.training.rollout import FROM_LATER, FROM_WARM_UP, Window
 
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
@@ -322,15 +322,16 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def collected_returns(self) -> tuple[list[float], list[float]]:
         """Return the returns of the collected trajectories, of the warm-up and of later ones.
 
-        A trajectory is of the warm-up if fewer than `warmup_steps` steps are stored before it. Of
-        several environments, whose episodes are stored one after the other although they run at
-        the same time, this can be wrong for those that were open when the warm-up ended.
+        In replay buffers that earlier versions saved, which lack `source`, a trajectory is of the
+        warm-up if fewer than `warmup_steps` steps are stored before it.
         """
         returns: tuple[list[float], list[float]] = ([], [])
         start = 0  # the number of steps before a trajectory
         for trajectory in self.replay_buffer.trajectories:
+            later = start >= self.hyperparameters.value("warmup_steps")
+            if trajectory.source in (FROM_WARM_UP, FROM_LATER):
+                later = trajectory.source == FROM_LATER
             if trajectory.reward is not None:
-                later = start >= self.hyperparameters.value("warmup_steps")
                 returns[later].append(float(trajectory.reward.sum()))
             start += len(trajectory)
         return returns

@@ -1,5 +1,6 @@
 """Collecting: the open episodes of several environments, and who decides on the actions."""
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -19,6 +20,10 @@ GO_ON = (
     "learn(..., reset_num_timesteps=False)"
 )
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
+WARM_UP: Window = 0, sys.maxsize  # the whole episode, however long it lasts
+# `Trajectory.source` of collected trajectories: whether they began in the warm-up
+FROM_WARM_UP = "warm-up"
+FROM_LATER = "after the warm-up"
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 
@@ -154,6 +159,7 @@ class Rollout:
             np.array(self.rewards[i], np.float32),
             terminated,
             embodiment=self.embodiment,
+            source=FROM_WARM_UP if self.windows[i] == WARM_UP else FROM_LATER,
         )
         self.images[i] = []
         self.actions[i] = []

@@ -196,7 +196,7 @@ class ConfiguredAgent(BaseAlgorithm):
             self.set_random_seed(changed.seed)
 
     def _show_entry(self) -> None:
-        """See the entry `image_key` of observations: the environment shows the former one alone."""
+        """Show the agent the entry `image_key`, by wrapping the environment again."""
         self.policy.image_key = self.hyperparameters.image_key
         if self.env is not None:
             self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)

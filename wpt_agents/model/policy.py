@@ -59,7 +59,7 @@ class WPTPolicy(PixelPolicy):
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
     imitator: Actor | None  # the actor without imagination: an imitation of the prior actor alone
     average_imitator: Actor | None  # of `imitator`, beside the average of `actor`
-    return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
+    return_scale: Tensor  # scalar, the running 5-95 % range of returns; 0 before the first ones
     updates: int  # raised whenever weights have changed: caches of them look at it
 
     def __init__(
@@ -101,7 +101,7 @@ class WPTPolicy(PixelPolicy):
         """Draw new weights for all that belongs to a task: reward head, actors, critics."""
         size = self.size
         device = self.device
-        self.world_model.reset_reward_head()
+        self.world_model.reset_heads()
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
         self.critic = Critic(size, self.zero_init_heads, self.bin_range).to(device)

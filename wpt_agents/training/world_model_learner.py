@@ -34,8 +34,7 @@ class WorldModelLearner:
         self.policy = policy
         self.hyperparameters = hyperparameters.resolved()
         model = policy.world_model
-        # One step for both, so weight decay counts once; in the authors' code it counts twice. The
-        # reward head sees detached states: rewards never train the world model.
+        # One step for both, so weight decay counts once; in the authors' code it counts twice.
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self.adam(parts, self.model_rate)
         self.add_continue_head()

@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
-from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
@@ -259,15 +259,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Number of updates of the head start (`actor_delay`) that are left to make."""
         return max(self.hyperparameters.actor_delay - self.progress.task_updates, 0)
 
-    def steps_per_update(self) -> float:
-        """Return how many collected steps the first update needs: none, if a head start is due."""
-        return 0.0 if self.head_start else super().steps_per_update()
+    def steps_to_update(self) -> float:
+        """Return how many collected steps pay for the next update: none, if a head start is due."""
+        return 0.0 if self.head_start else super().steps_to_update()
 
     def updates_due(self) -> int:
         """Return how many updates to make now: those for the collected steps, or the head start."""
         return max(super().updates_due(), self.head_start)
 
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update of every network on a mixed batch; append to `metrics`."""
         progress = self.progress
         self.prepare_update()

@@ -32,8 +32,7 @@ from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
 from wpt_agents.model.world_model import pessimistic_reward
 from wpt_agents.training.hyperparameters import Hyperparameters
-from wpt_agents.training.world_model_learner import Metrics as Metrics
-from wpt_agents.training.world_model_learner import WorldModelLearner
+from wpt_agents.training.world_model_learner import Metrics, WorldModelLearner
 
 
 class Worth(NamedTuple):
@@ -124,7 +123,7 @@ class Learner(WorldModelLearner):
         states_loss = None
         if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
-        post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
+        post, rewarded, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
         if advice is not None and corrects:
             metrics |= self.update_imitator(post, advice, imitation_weight)
@@ -136,10 +135,10 @@ class Learner(WorldModelLearner):
             imitation = imitation_weight * loss
         replay_loss: Tensor | float = 0.0
         if settings.repval_scale:
-            loss = self.replay_value_loss(post, paid)
+            loss = self.replay_value_loss(post, rewarded)
             metrics["train/replay_value_loss"] = loss.detach()
             replay_loss = settings.repval_scale * loss
-        dream, worth = self.dream(post, paid, generator, step, head_start)
+        dream, worth = self.dream(post, rewarded, generator, step, head_start)
         spread, scale = self.return_scale(worth.returns)
         metrics |= self.update_actor(dream, worth, scale, step, imitation, head_start)
         metrics |= self.update_critic(dream, worth, replay_loss)
@@ -225,16 +224,16 @@ class Learner(WorldModelLearner):
         return draw_starts(rows, length, number, generator, self.policy.device)
 
     def dream(
-        self, post: Latent, paid: Batch, generator: Generator, step: int, head_start: bool
+        self, post: Latent, rewarded: Batch, generator: Generator, step: int, head_start: bool
     ) -> tuple[Dream, Worth]:
         """Dream from replayed states, and compute what the dreams are worth.
 
         :param post: (B, T, ...), the states of the replayed steps
-        :param paid: the batch with the rewards of arriving in them
+        :param rewarded: the batch with the rewards of arriving in them
         """
-        index = self.draw_starts(paid, generator)
+        index = self.draw_starts(rewarded, generator)
         start = post.flatten_time().pick(index)
-        arrival = paid.reward.flatten()[index]
+        arrival = rewarded.reward.flatten()[index]
         # REINFORCE needs no gradient through the dream, nor does the actor in its head start.
         through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):

@@ -124,13 +124,16 @@ class WPTPolicy(PixelPolicy):
         self.updates += 1
         if not hasattr(self, "curiosity"):  # an explorer's, which does not take part in acting
             state_dict = {k: v for k, v in state_dict.items() if not k.startswith("curiosity.")}
-        for average in ("average_actor", "average_imitator"):
-            there = any(name.startswith(f"{average}.") for name in state_dict)
-            setattr(self, average, deepcopy(self.actor).requires_grad_(False) if there else None)
-        imitates = any(name.startswith("imitator.") for name in state_dict)
-        if imitates != (self.imitator is not None):
-            self.imitator = deepcopy(self.actor) if imitates else None
+        self.fit_actors(state_dict)
         return super().load_state_dict(state_dict, strict, assign)
+
+    def fit_actors(self, weights: Mapping[str, Any]) -> None:
+        """Add or remove imitator and averages, as the names of these weights say."""
+        for name in ("imitator", "average_actor", "average_imitator"):
+            there = any(weight.startswith(f"{name}.") for weight in weights)
+            if there != (getattr(self, name) is not None):
+                learns = name == "imitator"
+                setattr(self, name, deepcopy(self.actor).requires_grad_(learns) if there else None)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.updates += 1  # `to`, `half` and others move or convert the weights

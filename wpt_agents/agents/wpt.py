@@ -22,8 +22,9 @@ from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer, mix
-from wpt_agents.data.trajectory import Batch
+from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
@@ -175,9 +176,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return self
 
     def retrieve(self, progress_bar: bool = False) -> None:
-        """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
+        """Retrieve the R trajectories that begin most like the task, by Eq. (5), and read them."""
         settings = self.hyperparameters
-        progress = self.progress
         if not (settings.needs_clone or settings.offline_ratio):
             return
         if self.dataset is None:
@@ -186,26 +186,32 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         if self.retrieved is not None and not self.outdated:
             return
         kept = self.kept.trajectories if self.kept is not None else []
-        outdated = self.outdated
-        if not progress.retrieved_ids or outdated:
-            query = self.policy.embed(self.first_images(settings.retrieval_images))
-            index = self.build_index(progress_bar)
-            if kept:
-                index = with_kept(index, kept, self.policy.embed)
-            width = self.action_space.shape[0]
-            progress.retrieved_ids = retrieve_ids(
-                index, self.dataset, query, width, settings, self.streams
-            )
-            progress.retrieved_of = self.dataset.fingerprint
-            self.retrieved = None  # drop the old ones now: the reading below may be interrupted
-            if outdated and settings.needs_clone:
-                progress.cloned = False  # the prior actor was cloned from the old ones
+        if not self.progress.retrieved_ids or self.outdated:
+            self._search(self.dataset, kept, progress_bar)
         retrieved = ReplayBuffer()
-        ids = progress.retrieved_ids
+        ids = self.progress.retrieved_ids
         trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
         for trajectory in shown(trajectories, len(ids), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
         self.retrieved = retrieved  # only when it is complete, in case of an interruption
+
+    def _search(
+        self, dataset: TrajectoryDataset, kept: list[Trajectory], progress_bar: bool
+    ) -> None:
+        """Find the trajectories to retrieve, and drop what was made of earlier ones."""
+        progress = self.progress
+        settings = self.hyperparameters
+        outdated = self.outdated
+        query = self.policy.embed(self.first_images(settings.retrieval_images))
+        index = self.build_index(progress_bar)
+        if kept:
+            index = with_kept(index, kept, self.policy.embed)
+        width = self.action_space.shape[0]
+        progress.retrieved_ids = retrieve_ids(index, dataset, query, width, settings, self.streams)
+        progress.retrieved_of = dataset.fingerprint
+        self.retrieved = None  # now, because reading the new ones may be interrupted
+        if outdated and settings.needs_clone:
+            progress.cloned = False  # the prior actor was cloned from the old ones
 
     def _warn_without_dataset(self) -> None:
         """Warn if the missing dataset prevents cloning or rehearsal."""

@@ -22,8 +22,8 @@ GO_ON = (
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
 WARM_UP: Window = 0, sys.maxsize  # the whole episode, however long it lasts
 # `Trajectory.source` of collected trajectories: whether they began in the warm-up
-FROM_WARM_UP = "warm-up"
-FROM_LATER = "after the warm-up"
+FROM_WARM_UP = "collected in the warm-up"
+FROM_LATER = "collected after the warm-up"
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 

@@ -900,6 +900,20 @@ def test_another_dataset_counts_from_the_next_call_of_learn_on(store):
         model.bc_steps = 2
 
 
+def test_a_prior_actor_that_another_dataset_replaces_acts_no_longer(store, monkeypatch):
+    model = pretrained(store, env=ClockEnv(7), ibrl=True).learn(7)
+    assert model.policy.ibrl
+    model.set_dataset([recorded(length=20, seed=9)])
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cloning, "descend", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(7)
+    assert model.prior is None and not model.policy.ibrl
+
+
 def test_without_any_use_of_it_the_prior_actor_of_the_former_dataset_stays(store):
     model = pretrained(store, env=ClockEnv(7)).learn(7)
     clone = weights(model, "prior_actor")

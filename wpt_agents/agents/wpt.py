@@ -212,6 +212,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.retrieved = None  # now, because reading the new ones may be interrupted
         if outdated and settings.needs_clone:
             progress.cloned = False  # the prior actor was cloned from the old ones
+            self.choose_who_acts()
 
     def _warn_without_dataset(self) -> None:
         """Warn if the missing dataset prevents cloning or rehearsal."""

@@ -252,8 +252,8 @@ def test_noise_warm_up_and_the_first_update_begin_again_with_every_task():
     model.next_task(ClockEnv(25))
     retrained = model.updates
     assert model.std_now == 1.0 and model.num_timesteps == 0
-    drawn, window = [], model._draw_window
-    model._draw_window = lambda: drawn.append(window()) or drawn[-1]
+    drawn, window = [], model._next_window
+    model._next_window = lambda: drawn.append(window()) or drawn[-1]
     model.learn(25, reset_num_timesteps=False)
     assert drawn[0] == (0, sys.maxsize)  # the whole first episode is random, as in the first task
     assert model.updates - retrained == made

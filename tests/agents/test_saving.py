@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from debug_agent import SETTINGS, ClockEnv, agent, noise, pretrained, recorded, same, weights
+from sameness import FURTHER
 from stable_baselines3 import SAC
 
 from wpt_agents.agents.wpt import WPT
@@ -159,6 +160,31 @@ def test_learning_after_load_with_the_replay_equals_learning_in_one_go(tmp_path)
     loaded.learn(28, reset_num_timesteps=False)
     assert loaded.num_timesteps == 56 and loaded.updates == whole.updates
     assert same(weights(loaded), weights(whole))
+
+
+def test_a_resumed_run_of_all_keywords_equals_one_that_was_never_interrupted(store, tmp_path):
+    settings = {
+        **FURTHER,
+        "kickstart": "adaptive(20,1)",
+        "actor_critic_decay": False,  # which goes by the steps of the call of `learn`
+        "guidance": "linear(1,0,60)",
+        "recent_share": 0.5,
+        "max_trajectory_length": 5,
+        "warmup_steps": 14,
+        "train_ratio": 2,
+    }
+
+    def begun(steps):
+        return pretrained(store, env=ClockEnv(terminates=True), **settings).learn(steps)
+
+    whole, part = begun(42), begun(21)
+    part.save(tmp_path / "model")
+    part.save_replay_buffer(tmp_path / "replay")
+    rest = WPT.load(tmp_path / "model", env=ClockEnv(terminates=True), dataset=store)
+    rest.load_replay_buffer(tmp_path / "replay")
+    rest.learn(21, reset_num_timesteps=False)
+    assert rest.progress == whole.progress and whole.updates > part.updates > 0
+    assert same(weights(rest), weights(whole))
 
 
 def test_learning_goes_on_without_replay_and_keeps_what_was_retrieved(learnt, store, tmp_path):

@@ -172,6 +172,13 @@ def test_a_reset_can_be_spared_when_the_environment_is_set_again():
     assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 2
 
 
+def test_another_number_of_environments_is_reset_in_any_case():
+    model = agent(clocks(1)).learn(10)
+    model.set_env(clocks(3), force_reset=False)
+    model.learn(21, reset_num_timesteps=False)
+    assert [on_time(t) for t in model.replay_buffer.trajectories] == [True] * 4
+
+
 def test_attributes_that_are_set_on_a_vec_env_reach_its_environments():
     env = clocks(2)
     model = agent(env)

@@ -26,6 +26,7 @@ from toy_env import LENGTH, DotEnv
 from wpt_agents.agents import wpt
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.dataset import TrajectoryDataset
+from wpt_agents.data.replay import ReplayBuffer
 from wpt_agents.data.retrieval import Retriever
 from wpt_agents.data.trajectory import MarkedBatch, Trajectory
 from wpt_agents.model.observations import stack_frames
@@ -949,6 +950,20 @@ def test_another_dataset_counts_from_the_next_call_of_learn_on(store):
         model.bc_steps = 2
 
 
+def test_a_prior_actor_that_another_dataset_replaces_acts_no_longer(store, monkeypatch):
+    model = pretrained(store, env=ClockEnv(7), ibrl=True).learn(7)
+    assert model.policy.ibrl
+    model.set_dataset([recorded(length=20, seed=9)])
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cloning, "descend", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(7)
+    assert model.prior is None and not model.policy.ibrl
+
+
 def test_without_any_use_of_it_the_prior_actor_of_the_former_dataset_stays(store):
     model = pretrained(store, env=ClockEnv(7)).learn(7)
     clone = weights(model, "prior_actor")
@@ -1022,16 +1037,47 @@ def test_the_adaptive_weight_goes_by_the_returns_since_the_warm_up(store):
     assert model.imitation_weight() == 20
 
 
-def test_every_episode_that_began_in_the_warm_up_counts_as_one_of_it(store):
+def returns_of(model):
+    """The returns of the collected trajectories, in their order."""
+    return [float(episode.reward.sum()) for episode in model.replay_buffer.trajectories]
+
+
+def test_a_loaded_model_without_its_replay_takes_no_episode_of_its_own_for_the_prior_actors(
+    store, tmp_path
+):
     settings = {"kickstart": "adaptive(20,1)", "warmup_steps": LENGTH}
-    env = DummyVecEnv([DotEnv, DotEnv])  # both first episodes begin before step 25
-    model = pretrained(store, env=env, **settings).learn(4 * LENGTH)
-    episodes = model.replay_buffer.trajectories
-    by_hand = [float(episode.reward.sum()) for episode in episodes]
-    assert model.collected_returns() == (by_hand[:2], by_hand[2:]) and len(by_hand) == 4
-    # Replay buffers of earlier versions do not say it; their steps in order must do.
-    episodes[:] = [replace(episode, source=None) for episode in episodes]
-    assert model.collected_returns() == (by_hand[:1], by_hand[1:])
+    pretrained(store, env=DotEnv(), **settings).learn(2 * LENGTH).save(tmp_path / "model")
+    model = WPT.load(tmp_path / "model", env=DotEnv(), dataset=store)
+    model.learn(2 * LENGTH, reset_num_timesteps=False)
+    assert model.collected_returns() == ([], returns_of(model))
+    assert model.imitation_weight() == 20
+
+
+def test_a_second_warm_up_counts_as_the_prior_actors(store):
+    settings = {"kickstart": "adaptive(20,1)", "warmup_steps": LENGTH}
+    model = pretrained(store, env=DotEnv(), **settings)
+    model.learn(2 * LENGTH).learn(2 * LENGTH)
+    one, two, three, four = returns_of(model)
+    assert model.collected_returns() == ([one, three], [two, four])
+
+
+def test_of_several_environments_each_episode_counts_by_who_acted_in_it(store):
+    venv = DummyVecEnv([lambda: ClockEnv(length=7), lambda: ClockEnv(length=30)])
+    settings = {"kickstart": "adaptive(20,1)", "warmup_steps": 20}
+    model = pretrained(store, env=venv, **settings).learn(2 * 30)
+    # At step 14 (7 of each) the warm-up goes on, at step 28 it is over; 465 began in it.
+    assert model.collected_returns() == ([28, 28, 465], [28, 28])
+
+
+def test_replay_buffers_without_sources_are_told_apart_by_the_steps_before(store, tmp_path):
+    settings = {"kickstart": "adaptive(20,1)", "warmup_steps": LENGTH}
+    model = pretrained(store, env=DotEnv(), **settings).learn(3 * LENGTH)
+    labelled = model.collected_returns()
+    unlabelled = ReplayBuffer()
+    for episode in model.replay_buffer.trajectories:
+        unlabelled.add(replace(episode, source=None))
+    model.replay_buffer = unlabelled
+    assert model.collected_returns() == labelled == (returns_of(model)[:1], returns_of(model)[1:])
 
 
 def moved_by(model, keyword, value):

@@ -25,6 +25,7 @@ import torch
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
 from debug_agent import SETTINGS, ClockEnv, agent, pretrained, recorded
+from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import DotEnv
 
 from wpt_agents import WPT, TrajectoryDataset
@@ -75,7 +76,7 @@ def updated(model: WPT) -> dict[str, torch.Tensor]:
 
 
 def learnt(
-    method: Mapping[str, object], env: ClockEnv | None = None
+    method: Mapping[str, object], env: ClockEnv | DummyVecEnv | None = None
 ) -> tuple[WPT, dict[str, torch.Tensor]]:
     """Pre-train if the method has data, learn for a few episodes, then make 20 updates."""
     if "dataset" in method:
@@ -138,6 +139,10 @@ def main() -> None:
         "free nats": lambda: pretraining(accumulate=2, free_nats=1e3),
         "wpt": lambda: learnt({"dataset": data, "guidance": 1.0}),
         "kickstart": lambda: learnt({"dataset": data, "kickstart": "linear(20,2,100)"}),
+        "adaptive": lambda: learnt(
+            {"dataset": data, "kickstart": "adaptive(20,1)", "train_freq": "step"},
+            DummyVecEnv([lambda: ClockEnv(length=7), lambda: ClockEnv(length=5)]),
+        ),
         "scratch": lambda: learnt({"offline_ratio": 0.0, "guidance": 0.0}),
         "further": lambda: learnt({"dataset": data} | FURTHER, ClockEnv(terminates=True)),
         "reinforce": lambda: learnt(

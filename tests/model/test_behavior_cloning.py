@@ -126,6 +126,13 @@ def test_a_pair_is_what_was_seen_up_to_a_step_and_the_action_taken_at_it():
     assert share == pytest.approx(0.2, abs=0.06)
 
 
+def test_padding_of_another_width_is_left_out_of_the_pairs():
+    action = np.full((3, 5), 0.9, np.float32)  # of two entries and a padding that is not even zero
+    trajectory = Trajectory(np.zeros((4, 64, 64, 3), np.uint8), action, action_dim=2)
+    _, action, _ = draw_pairs([trajectory], 2, 4, np.random.default_rng(0))
+    torch.testing.assert_close(action, torch.tensor([[0.9, 0.9, 0.0, 0.0]] * 2))
+
+
 def test_weights_make_the_loss_that_of_gaussians_with_variances_of_their_own():
     prediction = torch.tensor([[0.5, 1.0, 9.0], [0.2, -0.5, 9.0]], requires_grad=True)
     action = torch.tensor([[0.1, 0.2, 0.0], [0.3, 0.4, 0.0]])

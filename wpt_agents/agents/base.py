@@ -44,9 +44,9 @@ from wpt_agents.training.evaluations import showing_same_entry
 from wpt_agents.training.outlook import Outlook
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.resets import resets
-from wpt_agents.training.rollout import WHOLE, Rollout, Window, last_images, step_all
+from wpt_agents.training.rollout import WARM_UP, Rollout, Window, last_images, step_all
 
-Metrics = dict[str, list[Tensor]]
+MetricLists = dict[str, list[Tensor]]  # of several updates, by the names of the log
 
 
 class PixelAgent(SavedAgent):
@@ -59,7 +59,7 @@ class PixelAgent(SavedAgent):
     # What a subclass must provide, besides `make_policy` and `make_learner`
 
     @abstractmethod
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update from `self.replay_buffer`; append to `metrics` by the log's names."""
 
     @property
@@ -95,8 +95,8 @@ class PixelAgent(SavedAgent):
     def on_episode(self, trajectory: Trajectory) -> None:
         """Handle a finished episode before it is added to the replay buffer."""
 
-    def steps_per_update(self) -> float:
-        """Return how many collected steps the first update needs."""
+    def steps_to_update(self) -> float:
+        """Return how many collected steps pay for the next update."""
         return 1 / self.updates_per_step
 
     def cheaper_updates(self, steps: int) -> str:
@@ -254,17 +254,17 @@ class PixelAgent(SavedAgent):
                 self.policy,
                 self.n_envs,
                 self.action_space.shape[0],
-                self._draw_window,
+                self._next_window,
                 self.guide,
                 self.streams.torch(Purpose.ACT, self.episodes + self.progress.cut, self.device),
                 self.hyperparameters.embodiment,
             )
         return self.rollout
 
-    def _draw_window(self) -> Window:
-        """Decide at an episode's start whether, and when, the guide acts."""
+    def _next_window(self) -> Window:
+        """Return the steps of a new trajectory at which the guide acts."""
         if self.num_timesteps < self.warmup_steps:
-            return WHOLE
+            return WARM_UP
         self.progress.windows_drawn += 1
         return self.guidance_window(self.streams.numpy(Purpose.WINDOW, self.progress.windows_drawn))
 
@@ -292,7 +292,7 @@ class PixelAgent(SavedAgent):
         updates = self.updates_due()
         price = 1 / self.updates_per_step
         rest = max(self.credit - updates * price, 0.0)
-        metrics: Metrics = defaultdict(list)
+        metrics: MetricLists = defaultdict(list)
         for left in reversed(range(updates)):
             self.update(metrics)
             if self.after_update is not None:

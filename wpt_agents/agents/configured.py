@@ -196,7 +196,7 @@ class ConfiguredAgent(BaseAlgorithm):
             self.set_random_seed(changed.seed)
 
     def _show_entry(self) -> None:
-        """See the entry `image_key` of observations: the environment shows the former one alone."""
+        """Show the agent the entry `image_key`, by wrapping the environment again."""
         self.policy.image_key = self.hyperparameters.image_key
         if self.env is not None:
             self.set_env(self.env.venv if isinstance(self.env, VecExtractDictObs) else self.env)
@@ -259,7 +259,8 @@ class ConfiguredAgent(BaseAlgorithm):
         If its actions have another width, what was learnt and collected for a task is discarded.
 
         :param env: an id, a Gymnasium environment, a vector environment, or a list of environments
-        :param force_reset: reset the environment at the next call of `learn`
+        :param force_reset: reset the environment at the next call of `learn`; another number of
+            copies is always reset
         :raises ValueError: observations that are not images, or actions that are not a bounded Box
         """
         self._use_env(self._checked(env), force_reset)
@@ -267,6 +268,8 @@ class ConfiguredAgent(BaseAlgorithm):
     def _use_env(self, env: VecEnv, force_reset: bool = True) -> None:
         assert isinstance(env.action_space, spaces.Box)
         other = env.action_space.shape != self.action_space.shape
+        if force_reset or env.num_envs != self.n_envs:
+            self._last_obs = None
         self.env = env
         self.n_envs = env.num_envs
         self._vec_normalize_env = unwrap_vec_normalize(env)
@@ -277,8 +280,6 @@ class ConfiguredAgent(BaseAlgorithm):
         self.policy.set_action_space(env.action_space)
         if other:
             self.on_other_actions()
-        if force_reset:
-            self._last_obs = None
         self.rollout = None
         self.check_units()
         if self.hyperparameters.seed is not None:

@@ -32,9 +32,9 @@ from wpt_agents.model.layers import frozen
 from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent
 from wpt_agents.training.hyperparameters import Hyperparameters
-from wpt_agents.training.learner import Learner, Metrics
+from wpt_agents.training.learner import Learner
 from wpt_agents.training.randomness import Purpose
-from wpt_agents.training.world_model_learner import StatesLoss
+from wpt_agents.training.world_model_learner import Metrics, StatesLoss
 
 # Keywords of WPT for exploring: nothing to retrieve, nobody to guide, two random episodes first.
 EXPLORE: Mapping[str, Any] = {
@@ -92,10 +92,10 @@ class ICMLearner(CuriousLearner):
         reward[:, 1:] = icm.scale(surprise.detach())
         known[:, 1:] = within
         batch = replace(batch, reward=reward, reward_known=known)
-        post, paid, metrics = super().update_world_model(
+        post, rewarded, metrics = super().update_world_model(
             batch, generator, learn_reward, states_loss
         )
-        return post, paid, metrics | {"explore/surprise": surprise.detach().mean()}
+        return post, rewarded, metrics | {"explore/surprise": surprise.detach().mean()}
 
 
 class Plan2ExploreLearner(CuriousLearner):
@@ -130,8 +130,8 @@ class Plan2ExploreLearner(CuriousLearner):
         known = torch.zeros_like(batch.is_first)
         reward[:, 1:] = ensemble.scale(surprise) * within
         known[:, 1:] = within
-        paid = replace(batch, reward=reward, reward_known=known)
-        return post, paid, metrics | {"explore/surprise": surprise[within].mean()}
+        rewarded = replace(batch, reward=reward, reward_known=known)
+        return post, rewarded, metrics | {"explore/surprise": surprise[within].mean()}
 
     def imagined_reward(self, dream: Dream, arrival: Tensor, step: int) -> Tensor:
         """Return the disagreement of the ensemble on imagined steps, (N, H)."""

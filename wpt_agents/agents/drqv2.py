@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords
 from wpt_agents.data.transitions import Transitions
 from wpt_agents.model.actor_critic import ema_update
@@ -272,7 +272,7 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
         """σ of the exploration schedule at the present step."""
         return parse_schedule(self.hyperparameters.std, np.inf, "std")(self.num_timesteps)
 
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update on transitions of the replay buffer."""
         settings = self.hyperparameters
         std = self.std_now

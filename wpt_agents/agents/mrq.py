@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor
 from torch.optim import AdamW
 
-from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords, FrameProgress
 from wpt_agents.data.transitions import Steps, Transitions, draw_steps
 from wpt_agents.model.frame_policy import FramePolicy
@@ -218,7 +218,7 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
         """σ of the noise on actions, which is the same at all steps."""
         return self.hyperparameters.std
 
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update on the replay. Once in `sync_every` updates, the encoder's come first."""
         settings = self.hyperparameters
         if (self.updates - self.progress.updates_before) % settings.sync_every == 0:

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Generator, Tensor, nn
 from torch.optim import Adam
 
-from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.frame_agent import FrameAgent, FrameKeywords
 from wpt_agents.agents.optimistic import label
 from wpt_agents.data.transitions import Transitions, concatenate
@@ -255,7 +255,7 @@ class RLPD(FrameAgent, keywords=RLPDKeywords):
         """Whether the rewards of offline data are used."""
         return self.hyperparameters.label == "true"
 
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update on online and offline transitions."""
         size = self.hyperparameters.batch_size
         offline = round(size * self.hyperparameters.offline_ratio) if self.retrieved else 0

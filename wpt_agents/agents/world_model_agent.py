@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from copy import deepcopy
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -125,9 +124,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         members = {name.split(".")[2] for name in weights if name.startswith(start)}
         model.make_reward_members(self.member_seeds(len(members)))
         self.learner.add_reward_members()
-        policy = self.policy
-        imitates = any(name.startswith("imitator.") for name in weights)
-        policy.imitator = deepcopy(policy.actor) if imitates else None
+        self.policy.fit_actors(weights)
         self.learner.add_imitator()
 
     def restore(

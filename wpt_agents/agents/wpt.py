@@ -18,12 +18,13 @@ from typing import Any, Self
 import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
-from wpt_agents.agents.base import Metrics
+from wpt_agents.agents.base import MetricLists
 from wpt_agents.agents.world_model_agent import WorldModelAgent
 from wpt_agents.data.bars import shown
 from wpt_agents.data.convert import Data
+from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer, mix
-from wpt_agents.data.trajectory import Batch
+from wpt_agents.data.trajectory import Batch, Trajectory
 from wpt_agents.files.model_file import read_model
 from wpt_agents.model.actor_critic import debiased_fraction
 from wpt_agents.model.prior_policy import prior_action
@@ -36,7 +37,7 @@ from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.retrieving import read_retrieved, retrieve_ids, with_kept
-from wpt_agents.training.rollout import WARM_UP, Window
+from wpt_agents.training.rollout import FROM_LATER, FROM_WARM_UP, Window
 
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
@@ -176,9 +177,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return self
 
     def retrieve(self, progress_bar: bool = False) -> None:
-        """Retrieve the R trajectories that begin most like the task, by Eq. (5)."""
+        """Retrieve the R trajectories that begin most like the task, by Eq. (5), and read them."""
         settings = self.hyperparameters
-        progress = self.progress
         if not settings.retrieves:
             return
         if self.dataset is None:
@@ -187,27 +187,35 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         if self.retrieved is not None and not self.outdated:
             return
         kept = self.kept.trajectories if self.kept is not None else []
-        outdated = self.outdated
-        if not progress.retrieved_ids or outdated:
-            query = self.policy.embed(self.first_images(settings.retrieval_images))
-            index = self.build_index(progress_bar)
-            if kept:
-                index = with_kept(index, kept, self.policy.embed)
-            width = self.action_space.shape[0]
-            progress.retrieved_ids = retrieve_ids(
-                index, self.dataset, query, width, settings, self.streams
-            )
-            progress.retrieved_of = self.dataset.fingerprint
-            self.retrieved = None  # drop the old ones now: the reading below may be interrupted
-            if outdated and settings.needs_clone:
-                progress.cloned = False  # the prior actor was cloned from the old ones
-            progress.adapted = 0 if outdated else progress.adapted
+        if not self.progress.retrieved_ids or self.outdated:
+            self._search(self.dataset, kept, progress_bar)
         retrieved = ReplayBuffer()
-        ids = progress.retrieved_ids
+        ids = self.progress.retrieved_ids
         trajectories = read_retrieved(self.dataset, kept, ids, self.action_space)
         for trajectory in shown(trajectories, len(ids), "retrieve", progress_bar):
             retrieved.add(replace(trajectory, reward=None))
         self.retrieved = retrieved  # only when it is complete, in case of an interruption
+
+    def _search(
+        self, dataset: TrajectoryDataset, kept: list[Trajectory], progress_bar: bool
+    ) -> None:
+        """Find the trajectories to retrieve, and drop what was made of earlier ones."""
+        progress = self.progress
+        settings = self.hyperparameters
+        outdated = self.outdated
+        query = self.policy.embed(self.first_images(settings.retrieval_images))
+        index = self.build_index(progress_bar)
+        if kept:
+            index = with_kept(index, kept, self.policy.embed)
+        width = self.action_space.shape[0]
+        progress.retrieved_ids = retrieve_ids(index, dataset, query, width, settings, self.streams)
+        progress.retrieved_of = dataset.fingerprint
+        self.retrieved = None  # now, because reading the new ones may be interrupted
+        if outdated:
+            progress.adapted = 0
+            # If it is not cloned again, the prior actor of the old ones stays.
+            progress.cloned = progress.cloned and not settings.needs_clone
+            self.choose_who_acts()
 
     def _warn_without_dataset(self) -> None:
         """Warn if the missing dataset prevents cloning or rehearsal."""
@@ -277,15 +285,15 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Number of updates of the head start (`actor_delay`) that are left to make."""
         return max(self.hyperparameters.actor_delay - self.progress.task_updates, 0)
 
-    def steps_per_update(self) -> float:
-        """Return how many collected steps the first update needs: none, if a head start is due."""
-        return 0.0 if self.head_start else super().steps_per_update()
+    def steps_to_update(self) -> float:
+        """Return how many collected steps pay for the next update: none, if a head start is due."""
+        return 0.0 if self.head_start else super().steps_to_update()
 
     def updates_due(self) -> int:
         """Return how many updates to make now: those for the collected steps, or the head start."""
         return max(super().updates_due(), self.head_start)
 
-    def update(self, metrics: Metrics) -> None:
+    def update(self, metrics: MetricLists) -> None:
         """Make one update of every network on a mixed batch; append to `metrics`."""
         progress = self.progress
         self.prepare_update()
@@ -338,14 +346,18 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return max(weight, 1.0) if self.head_start else weight
 
     def collected_returns(self) -> tuple[list[float], list[float]]:
-        """Return the returns of the collected trajectories, of the warm-up and of later ones."""
+        """Return the returns of the collected trajectories, of the warm-up and of later ones.
+
+        In replay buffers that earlier versions saved, which lack `source`, a trajectory is of the
+        warm-up if fewer than `warmup_steps` steps are stored before it.
+        """
         returns: tuple[list[float], list[float]] = ([], [])
         start = 0  # the number of steps that were stored before a trajectory
         for trajectory in self.replay_buffer.trajectories:
+            later = start >= self.hyperparameters.value("warmup_steps")
+            if trajectory.source in (FROM_WARM_UP, FROM_LATER):
+                later = trajectory.source == FROM_LATER
             if trajectory.reward is not None:
-                later = trajectory.source != WARM_UP
-                if trajectory.source is None:  # in replay buffers of earlier versions
-                    later = start >= self.hyperparameters.value("warmup_steps")
                 returns[later].append(float(trajectory.reward.sum()))
             start += len(trajectory)
         return returns

@@ -24,7 +24,7 @@ LABELS = ("terminated", "action_dim", "embodiment", "task", "source")
 class ReplayBuffer:
     """Episodes, and parts of long ones, in memory, without a capacity limit.
 
-    :ivar trajectories: they, in the order of addition; change it through `add` only
+    :ivar trajectories: in the order of addition; change the list through `add` only
     """
 
     def __init__(self) -> None:

@@ -2,7 +2,8 @@
 
 At batch size 1 there is little arithmetic. Most of the time is spent on calling operators, on
 reading weights against their order in memory, and on copying them into another order. These copies
-are cached here, and renewed only when weights have changed: between episodes, not between steps.
+are cached here, and renewed only when weights have changed: between episodes, unless
+`train_freq="step"`.
 """
 
 from typing import Any

@@ -15,7 +15,7 @@ from wpt_agents.model.distributions import (
 from wpt_agents.model.layers import Head
 from wpt_agents.model.sizes import Size
 
-CONTEXT = 3  # images behind a state from which on more of them improve predictions no further
+CONTEXT = 3  # images that a state has to have seen; more of them do not improve predictions
 
 
 def lambda_return(

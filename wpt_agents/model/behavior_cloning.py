@@ -85,8 +85,8 @@ def draw_pairs(
     image = np.stack([trajectories[i].image[t] for i, t in zip(chosen, times, strict=True)])
     action = np.zeros((n, action_dim), np.float32)
     for row, i, t in zip(action, chosen, steps, strict=True):
-        taken = trajectories[i].action[t]
-        row[: len(taken)] = taken
+        used = trajectories[i].action_dim  # behind it may be padding of another width
+        row[:used] = trajectories[i].action[t, :used]
     return torch.from_numpy(image), torch.from_numpy(action), torch.from_numpy(chosen)
 
 

@@ -106,7 +106,7 @@ def two_hot_loss(logits: Tensor, target: Tensor, bin_range: float = BIN_RANGE) -
 
 
 def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:
-    """Log-probabilities of 99 % softmax and 1 % uniform: no class ever has probability zero.
+    """Log-probabilities of (1 - unimix) softmax + unimix / K: no class has probability zero.
 
     :param logits: (..., K)
     """

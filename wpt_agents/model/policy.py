@@ -59,7 +59,7 @@ class WPTPolicy(PixelPolicy):
     average_actor: Actor | None  # of `actor` over updates, in whose place it acts
     imitator: Actor | None  # the actor without imagination: an imitation of the prior actor alone
     average_imitator: Actor | None  # of `imitator`, beside the average of `actor`
-    return_scale: Tensor  # scalar, which returns are divided by; 0 before the first returns
+    return_scale: Tensor  # scalar, the running 5-95 % range of returns; 0 before the first ones
     updates: int  # raised whenever weights have changed: caches of them look at it
 
     def __init__(
@@ -101,7 +101,7 @@ class WPTPolicy(PixelPolicy):
         """Draw new weights for all that belongs to a task: reward head, actors, critics."""
         size = self.size
         device = self.device
-        self.world_model.reset_reward_head()
+        self.world_model.reset_heads()
         self.world_model.to(device)
         self.actor = Actor(size, self.max_action_dim, self.actor_outscale).to(device)
         self.critic = Critic(size, self.zero_init_heads, self.bin_range).to(device)
@@ -124,13 +124,16 @@ class WPTPolicy(PixelPolicy):
         self.updates += 1
         if not hasattr(self, "curiosity"):  # an explorer's, which does not take part in acting
             state_dict = {k: v for k, v in state_dict.items() if not k.startswith("curiosity.")}
-        for average in ("average_actor", "average_imitator"):
-            there = any(name.startswith(f"{average}.") for name in state_dict)
-            setattr(self, average, deepcopy(self.actor).requires_grad_(False) if there else None)
-        imitates = any(name.startswith("imitator.") for name in state_dict)
-        if imitates != (self.imitator is not None):
-            self.imitator = deepcopy(self.actor) if imitates else None
+        self.fit_actors(state_dict)
         return super().load_state_dict(state_dict, strict, assign)
+
+    def fit_actors(self, weights: Mapping[str, Any]) -> None:
+        """Add or remove imitator and averages, as the names of these weights say."""
+        for name in ("imitator", "average_actor", "average_imitator"):
+            there = any(weight.startswith(f"{name}.") for weight in weights)
+            if there != (getattr(self, name) is not None):
+                learns = name == "imitator"
+                setattr(self, name, deepcopy(self.actor).requires_grad_(learns) if there else None)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.updates += 1  # `to`, `half` and others move or convert the weights

@@ -127,7 +127,7 @@ class RSSM(nn.Module):
         return linear(embed, self.post_in.weight[:, self.size.deter :], self.post_in.bias)
 
     def posterior_of_halves(self, deter: Tensor, embed_half: Tensor) -> Tensor:
-        """q(z | h, o) of h and the image's share of the first layer."""
+        """q(z | h, o) with the result of `embed_half`: (..., D), (..., hidden) -> (..., S, K)."""
         deter_half = linear(deter, self.post_in.weight[:, : self.size.deter])
         return self._log_probs(self.post_out(deter_half + embed_half))
 

@@ -112,7 +112,7 @@ def reward_loss(
 ) -> Tensor:
     """-ln p_xi(r_t | s_t), averaged over the steps whose reward is known (A.3, Algorithm 1).
 
-    :param logits: (B, T, bins), the reward head's output on detached features
+    :param logits: (B, T, bins), the reward head's output
     :param reward: (B, T)
     :param known: (B, T) bool
     :param bin_range: of the bins, in symlog space
@@ -164,10 +164,10 @@ class WorldModel(nn.Module):
         self.size = size
         self.zero_init_heads = zero_init_heads
         self.bin_range = bin_range
-        self.reset_reward_head()
+        self.reset_heads()
 
-    def reset_reward_head(self) -> None:
-        """Draw new weights for what belongs to a task: rewards do, and where episodes end."""
+    def reset_heads(self) -> None:
+        """Draw a new reward head, and remove the other heads: all of them belong to a task."""
         # Two layers, as in the authors' code; Table 2 says three for all heads.
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
         self.reward_members = nn.ModuleList()
@@ -201,7 +201,7 @@ class WorldModel(nn.Module):
         return head.to(self.rssm.post_in.weight.device)
 
     def dynamics_parameters(self) -> list[nn.Parameter]:
-        """Return theta: the parameters of everything but the reward head."""
+        """Return θ of Eq. (1): the parameters of everything but the heads."""
         return [p for part in (self.encoder, self.rssm, self.decoder) for p in part.parameters()]
 
     @torch.no_grad()

@@ -32,8 +32,7 @@ from wpt_agents.model.policy import Dream, WPTPolicy
 from wpt_agents.model.rssm import Latent, over_steps
 from wpt_agents.model.world_model import pessimistic_reward
 from wpt_agents.training.hyperparameters import Hyperparameters
-from wpt_agents.training.world_model_learner import Metrics as Metrics
-from wpt_agents.training.world_model_learner import WorldModelLearner
+from wpt_agents.training.world_model_learner import Metrics, WorldModelLearner
 
 
 class Worth(NamedTuple):
@@ -119,14 +118,14 @@ class Learner(WorldModelLearner):
         :param head_start: train the actor on nothing but that imitation (`actor_delay`)
         """
         settings = self.hyperparameters
-        corrects = settings.residual and self.policy.imitator is not None
-        advice = self.advice(batch) if imitation_weight or corrects else None
+        has_imitator = settings.residual and self.policy.imitator is not None
+        advice = self.advice(batch) if imitation_weight or has_imitator else None
         states_loss = None
         if advice is not None and imitation_weight and settings.imitation_grad:
             states_loss = partial(self.states_loss, advice=advice)
-        post, paid, metrics = self.update_world_model(batch, generator, True, states_loss)
+        post, rewarded, metrics = self.update_world_model(batch, generator, True, states_loss)
         metrics |= self.update_continue_head(post, batch)
-        if advice is not None and corrects:
+        if advice is not None and has_imitator:
             metrics |= self.update_imitator(post, advice, imitation_weight)
         imitation: Tensor | float = 0.0
         if advice is not None and imitation_weight:
@@ -136,10 +135,10 @@ class Learner(WorldModelLearner):
             imitation = imitation_weight * loss
         replay_loss: Tensor | float = 0.0
         if settings.repval_scale:
-            loss = self.replay_value_loss(post, paid)
+            loss = self.replay_value_loss(post, rewarded)
             metrics["train/replay_value_loss"] = loss.detach()
             replay_loss = settings.repval_scale * loss
-        dream, worth = self.dream(post, paid, generator, step, head_start)
+        dream, worth = self.dream(post, rewarded, generator, step, head_start)
         spread, scale = self.return_scale(worth.returns)
         metrics |= self.update_actor(dream, worth, scale, step, imitation, head_start)
         metrics |= self.update_critic(dream, worth, replay_loss)
@@ -186,7 +185,11 @@ class Learner(WorldModelLearner):
 
     @torch.no_grad()
     def correction(self, imitator: Actor, post: Latent) -> Tensor:
-        """Return the root mean square of what `residual` adds to the prior actor's actions."""
+        """Return the root mean square of what `residual` adds to the prior actor's actions.
+
+        :param post: (B, T, ...), the states of the replayed steps
+        :return: scalar, over the embodiment's own entries
+        """
         mask = self.policy.action_mask
         feat = post.feat.flatten(0, 1)
         with self.autocast():
@@ -194,7 +197,11 @@ class Learner(WorldModelLearner):
         return added[:, mask].square().mean().sqrt()
 
     def states_loss(self, post: Latent, advice: Tensor) -> Tensor:
-        """Return the loss by which imitation trains the states, weighted; the actor is fixed."""
+        """Return the loss by which imitation trains the states, weighted; the actor is fixed.
+
+        :param post: (B, T, ...), the states of the replayed steps, with their gradient
+        :param advice: (B (T - 2), A), the prior actor's actions
+        """
         actor = self.policy.actor
         with frozen(actor):
             return self.hyperparameters.imitation_grad * self.imitation_loss(actor, post, advice)
@@ -204,6 +211,8 @@ class Learner(WorldModelLearner):
 
         DreamerV3 bootstraps by the return of a dream from each replayed state. Here dreams start
         from some of them only (`imagine_starts`), so the target critic's value stands for it.
+
+        :param post: (B, T, ...), the states of the replayed steps
         """
         settings = self.hyperparameters
         with self.autocast():
@@ -225,16 +234,16 @@ class Learner(WorldModelLearner):
         return draw_starts(rows, length, number, generator, self.policy.device)
 
     def dream(
-        self, post: Latent, paid: Batch, generator: Generator, step: int, head_start: bool
+        self, post: Latent, rewarded: Batch, generator: Generator, step: int, head_start: bool
     ) -> tuple[Dream, Worth]:
         """Dream from replayed states, and compute what the dreams are worth.
 
         :param post: (B, T, ...), the states of the replayed steps
-        :param paid: the batch with the rewards of arriving in them
+        :param rewarded: the batch with the rewards of arriving in them
         """
-        index = self.draw_starts(paid, generator)
+        index = self.draw_starts(rewarded, generator)
         start = post.flatten_time().pick(index)
-        arrival = paid.reward.flatten()[index]
+        arrival = rewarded.reward.flatten()[index]
         # REINFORCE needs no gradient through the dream, nor does the actor in its head start.
         through_dream = self.hyperparameters.actor_grad == "dynamics" and not head_start
         with self.autocast(), torch.set_grad_enabled(through_dream):
@@ -276,7 +285,10 @@ class Learner(WorldModelLearner):
             return over_steps(model.goes_on, dream.states.but_last())
 
     def return_scale(self, returns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the running 5-95 % range of the returns, and what they are divided by."""
+        """Return the running 5-95 % range of the returns, and what they are divided by: scalars.
+
+        :param returns: (N, H)
+        """
         before = self.policy.return_scale
         if not self.hyperparameters.value("return_norm"):
             return before, torch.ones_like(before)

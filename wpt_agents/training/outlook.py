@@ -59,7 +59,7 @@ class Outlook:
             opened=0 if fresh else rollout.longest_open(),
             longest=agent.max_trajectory_length,
             limit=time_limit(agent.env),
-            price=agent.steps_per_update() if agent.updates_per_step else math.inf,
+            price=agent.steps_to_update() if agent.updates_per_step else math.inf,
             credit=agent.credit,
             learning_starts=agent.learning_starts,
             warmup_pays=agent.warmup_pays,

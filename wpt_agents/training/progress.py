@@ -19,7 +19,7 @@ class Progress:
     :ivar episodes: episodes that were collected
     :ivar updates: updates that were made for a task
     :ivar credit: collected steps that no update has used yet
-    :ivar windows_drawn: episodes for which a guidance window was drawn
+    :ivar windows_drawn: trajectories for which a guidance window was drawn
     :ivar seen_length: steps of the longest trajectory so far
     :ivar cut: trajectories that were stored before their episode ended
     :ivar earlier_steps: steps before `num_timesteps` began at 0 again

@@ -41,7 +41,7 @@ def retrieve_ids(
         warnings.warn(
             f"The dataset has no robot named {settings.embodiment!r} (it has {others}): "
             f"trajectories of any robot with {width} actions are retrieved, rehearsed and cloned",
-            stacklevel=4,
+            stacklevel=5,
         )
     number = settings.value("num_retrieve")
     if settings.retrieval == "random":

@@ -21,8 +21,10 @@ GO_ON = (
     "learn(..., reset_num_timesteps=False)"
 )
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
-WHOLE: Window = (0, sys.maxsize)  # of the warm-up: the whole episode, however long it lasts
-WARM_UP, LATER = "warm-up", "after the warm-up"  # the sources of collected trajectories
+WARM_UP: Window = 0, sys.maxsize  # the whole episode, however long it lasts
+# `Trajectory.source` of collected trajectories: whether they began in the warm-up
+FROM_WARM_UP = "collected in the warm-up"
+FROM_LATER = "collected after the warm-up"
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 
@@ -158,7 +160,7 @@ class Rollout:
             np.array(self.rewards[i], np.float32),
             terminated,
             embodiment=self.embodiment,
-            source=WARM_UP if self.windows[i] == WHOLE else LATER,
+            source=FROM_WARM_UP if self.windows[i] == WARM_UP else FROM_LATER,
         )
         self.images[i] = []
         self.actions[i] = []

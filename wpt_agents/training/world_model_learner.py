@@ -34,8 +34,7 @@ class WorldModelLearner:
         self.policy = policy
         self.hyperparameters = hyperparameters.resolved()
         model = policy.world_model
-        # One step for both, so weight decay counts once; in the authors' code it counts twice. The
-        # reward head sees detached states: rewards never train the world model.
+        # One step for both, so weight decay counts once; in the authors' code it counts twice.
         parts = [model.dynamics_parameters(), list(model.reward_head.parameters())]
         self.model_optimizer = self.adam(parts, self.model_rate)
         self.add_continue_head()
@@ -112,7 +111,10 @@ class WorldModelLearner:
         return post, batch, metrics | world_model_metrics(loss, norm)
 
     def update_reward_members(self, post: Latent, batch: Batch) -> Metrics:
-        """Take a step on the further reward heads, if there are any."""
+        """Take a step on the further reward heads, if there are any.
+
+        :param post: (B, T, ...), the posterior states, without gradient
+        """
         model = self.policy.world_model
         if self.members_optimizer is None:
             return {}
@@ -128,7 +130,10 @@ class WorldModelLearner:
         return {"train/reward_disagreement": spread}
 
     def update_continue_head(self, post: Latent, batch: Batch) -> Metrics:
-        """Take a step on the continue head, if there is one, on the rows of the task itself."""
+        """Take a step on the continue head, if there is one, on the rows of the task itself.
+
+        :param post: (B, T, ...), the posterior states, without gradient
+        """
         head = self.policy.world_model.continue_head
         optimizer = self.continue_optimizer
         if head is None or optimizer is None or not self.hyperparameters.continue_head:

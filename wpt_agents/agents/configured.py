@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, unwrap_vec_normalize
 
 from wpt_agents.agents.attributes import declare
+from wpt_agents.agents.sb3_keywords import unknown_keyword
 from wpt_agents.data.convert import Data, open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
@@ -90,7 +91,7 @@ class ConfiguredAgent(BaseAlgorithm):
         **keywords: Any,
     ) -> None:
         if unknown := keywords.keys() - self.keywords.declared().keys():
-            raise TypeError(str(unknown_name("keyword", min(unknown), self.keywords.declared())))
+            raise unknown_keyword(min(unknown), self.keywords.declared())
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise unknown_name("policy", policy, self.policy_aliases)
         check_device(device)

@@ -13,7 +13,7 @@ from wpt_agents.files.names import counted
 from wpt_agents.zoo.numbers import interval_text, number
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, normalised, printed_scores
-from wpt_agents.zoo.report.headline import SUITES
+from wpt_agents.zoo.report.headline import suite_title
 from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
 from wpt_agents.zoo.report.tables import markdown_table
@@ -118,10 +118,7 @@ def paper_scores(suite: str) -> dict[str, dict[str, float]]:
 def markdown(lines: Sequence[Line]) -> str:
     """Return a table for each suite, with a sentence about what it compares."""
     suites = evidence(lines)
-    parts = [
-        f"## {SUITES.get(one.suite, one.suite)}\n\n{explanation(one)}\n{table(one)}"
-        for one in suites
-    ]
+    parts = [f"## {suite_title(one.suite)}\n\n{explanation(one)}\n{table(one)}" for one in suites]
     shown = {task for one in suites for task in one.tasks}
     if changed := sorted({line.task for line in lines if line.frames} - shown):
         parts.append(

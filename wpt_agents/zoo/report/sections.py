@@ -12,7 +12,7 @@ from wpt_agents.zoo.plan.methods import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, Aggregate, Estimate, Experiment
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.headline import OURS, SUITES
+from wpt_agents.zoo.report.headline import OURS, suite_title
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
@@ -107,7 +107,7 @@ def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
     results = [run.result for run in of_suite]
     experiments = aggregates.by_experiment(results)
     return Section(
-        name=SUITES[suite],
+        name=suite_title(suite),
         names=list(dict.fromkeys(map(names, experiments))),
         all_names=names.all,
         tasks=sum(row.suite == suite and row.in_paper for row in TASKS.values()),
@@ -173,7 +173,7 @@ def profile(suite: str, experiments: Mapping[Experiment, Scores], names: Names) 
         if resamplable(scores):
             ends = bootstrap(shares, scores, draws=2000)
         lines.append(figures.Line(names(one), THRESHOLDS, (middle, *ends)))
-    title = f"{SUITES[suite]}: performance profile"
+    title = f"{suite_title(suite)}: performance profile"
     return figures.lines(
         title, "normalised score τ", "share of runs > τ", lines, names.all, step=True
     )
@@ -207,7 +207,7 @@ def draw_ablation(
             scores = [np.array(s) for task, s in experiments[one].items() if task in common]
             values[part] = aggregates.estimate(mean, scores)
             colours.append(figures.colour_of(names(one), names.all))
-    title = f"{SUITES[suite]}: ablation, {budget}"
+    title = f"{suite_title(suite)}: ablation, {budget}"
     return figures.bars(title, f"normalised mean, tasks: {len(common)}", values, colours)
 
 

@@ -179,11 +179,12 @@ def test_every_run_shows_its_command_seed_commit_and_the_first_its_pictures(page
 
 def test_a_suite_and_a_method_that_were_added_are_on_the_page_under_their_names(tmp_path):
     for seed in range(2):
-        for method in ("mine", "wpt"):
-            make_run(tmp_path, "dots-left", seed, method, (0.0, 10.0))
+        for method, low in (("mine", 9.0), ("scratch", 0.0), ("wpt", 0.0)):
+            make_run(tmp_path, "dots-left", seed, method, (low, 10.0))
     write_page(tmp_path, tmp_path / "index.html")
     page = (tmp_path / "index.html").read_text()
-    assert "<h2>dots</h2>" in page and "mine" in text(page)
+    assert "<h2>dots</h2>" in page
+    assert "wpt scratch 0.50 1 wpt mine 0.00 1 mine scratch 1.00 1" in text(page)
 
 
 @pytest.mark.parametrize(("media", "videos"), [("all", 6), ("none", 0)])

@@ -131,11 +131,14 @@ def markdown(lines: Sequence[Line]) -> str:
 def explanation(one: Evidence) -> str:
     """Return the explanation of a table's columns and its last row."""
     unit = UNITS.get(one.suite, " or ".join(UNITS.values()))
+    published = any(task in scores for scores in one.paper.values() for task in one.tasks)
     text = (
         f"A score is {unit}, averaged over seeds; if there are several, their number is in "
         f"brackets. The column of a method shows its last policy after {one.frames:,} frames with "
-        f"the unchanged preset `{one.preset}`. The paper's columns are at {PAPER_BUDGET:,} frames. "
+        f"the unchanged preset `{one.preset}`. "
     )
+    if published:
+        text += f"The paper's columns are at {PAPER_BUDGET:,} frames. "
     if any(f"{name}, last" in one.scores for name in one.scores):
         text += (
             "If there is a column `METHOD, last`, that is the last policy, and the column `METHOD` "
@@ -146,7 +149,7 @@ def explanation(one: Evidence) -> str:
         "number of these tasks and, from three tasks on, the 95 % interval by a bootstrap over "
         "tasks."
     )
-    if one.ours is not None:
+    if published and one.ours is not None:
         text += f" In the paper's columns, only tasks with a score of `{one.ours}` count."
     if one.with_gap:
         text += f' The row "mean, with a gap" averages over the tasks {GAP}.'

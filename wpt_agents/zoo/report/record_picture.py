@@ -188,8 +188,10 @@ def draw_panels(lines: Sequence[Line]) -> Figure:
         _draw_panel(panel, task.removeprefix(f"{suite}-"), rows)
     for panel in panels.flat[len(tasks) :]:
         panel.remove()
-    explained = "a dot per seed, a stroke at their mean;", "hollow: the paper's"
-    space = " " if columns > 1 else "\n"  # a single panel is narrow
+    explained = ["a dot per seed, a stroke at their mean"]
+    if any(row.style is None for rows in tasks.values() for row in rows):
+        explained.append("hollow: the paper's")
+    space = "; " if columns > 1 else ";\n"  # a single panel is narrow
     figure.supxlabel(f"score, 0 to 100\n{space.join(explained)}", fontsize=9)
     return figure
 

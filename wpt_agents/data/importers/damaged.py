@@ -6,7 +6,7 @@ from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.trajectory import Trajectory
 
 SECONDS = 30.0  # how long to look for further damaged episodes
-ALIKE = 10  # if so many fail in a row, the options are probably wrong, not the episodes
+ALIKE = 10  # failures in a row, after which the options are probably wrong
 
 
 def converted(episodes: Episodes, i: int) -> Trajectory:

@@ -5,7 +5,6 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,7 +23,7 @@ from wpt_agents.training.checks import check_device
 from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.keywords import Keywords, Stage
 from wpt_agents.training.progress import Progress
-from wpt_agents.training.randomness import Streams, torch_seed
+from wpt_agents.training.randomness import Streams, free_seed
 from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
@@ -98,7 +97,7 @@ class ConfiguredAgent(BaseAlgorithm):
         self.hyperparameters = self.keywords(**keywords)
         self.progress = self.progress_class()
         seed = self.hyperparameters.seed
-        self.streams = Streams(torch_seed(np.random.default_rng()) if seed is None else seed)
+        self.streams = Streams(free_seed() if seed is None else seed)
         super().__init__(
             policy or next(iter(self.policy_aliases)),
             None,

@@ -3,8 +3,8 @@
     python examples/compare_baseline.py --seeds 3 --steps 1500
 
 The data are episodes of random actions in the environment of custom_environment.py, without
-rewards. `python -m wpt_agents.zoo run` makes such comparisons for the tasks of the library, and
-reports them with intervals.
+rewards. Each mean has the zoo's 95 % interval over seeds. `python -m wpt_agents.zoo run` makes such
+comparisons for the tasks of the library.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from custom_environment import SETTINGS, PushDot
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from wpt_agents import WPT, Trajectory, TrajectoryDataset
+from wpt_agents.zoo.statistics import mean_interval
 
 
 def record(folder: Path, episodes: int) -> TrajectoryDataset:
@@ -51,7 +52,9 @@ def main(
             mean, _ = evaluate_policy(model, PushDot(), n_eval_episodes=10, warn=False)
             scores[name].append(float(mean))
     for name, values in scores.items():
-        print(f"{name}: {np.mean(values):.1f}, seeds {np.round(values, 1).tolist()}")
+        mean, low, high = mean_interval(values)  # by Student's t over seeds, from three seeds on
+        interval = "" if low is None else f" (95 % interval {low:.1f} to {high:.1f})"
+        print(f"{name}: {mean:.1f}{interval}, seeds {np.round(values, 1).tolist()}")
     return scores
 
 

@@ -64,13 +64,14 @@ def test_a_continue_head_is_compared_with_none(example, capsys):
 
 
 @pytest.mark.slow
-def test_pretraining_is_compared_with_scratch(example, tmp_path):
+def test_pretraining_is_compared_with_scratch(example, tmp_path, capsys):
     compare = example("compare_baseline").main
-    scores = compare(2, 50, tmp_path / "data", pretrain_steps=2, **SMALL | {"size": "debug"})
+    scores = compare(3, 50, tmp_path / "data", pretrain_steps=2, **SMALL | {"size": "debug"})
     assert {name: len(values) for name, values in scores.items()} == {
-        "pre-trained": 2,
-        "from scratch": 2,
+        "pre-trained": 3,
+        "from scratch": 3,
     }
+    assert capsys.readouterr().out.count("(95 % interval ") == 2
 
 
 def test_learning_in_blocks_goes_on_from_the_last_one(example, tmp_path, capsys):

@@ -494,6 +494,7 @@ def test_callbacks_come_in_order_and_see_the_step():
     assert record.total == 8 and record.seen["self"] is model
     assert record.seen["rewards"].tolist() == [1] and record.seen["dones"].tolist() == [False]
     assert record.seen["new_obs"].shape == (1, 64, 64, 3) and len(record.seen["infos"]) == 1
+    assert record.seen["actions"].shape == (1, 2)
 
 
 def test_callbacks_may_be_a_list_or_a_function():
@@ -600,6 +601,13 @@ def test_the_zoo_of_sb3_makes_and_loads_it_by_its_own_keywords(tmp_path):
     keywords = {"seed": 3, "tensorboard_log": str(tmp_path), "verbose": 0, "gamma": 0.9}
     loaded = WPT.load(tmp_path / "model.zip", env=ClockEnv(), custom_objects={}, **keywords)
     assert (loaded.seed, loaded.gamma, loaded.tensorboard_log) == (3, 0.9, str(tmp_path))
+
+
+def test_custom_objects_replace_keywords_of_the_file(tmp_path):
+    agent().save(tmp_path / "model")
+    custom = {"gamma": 0.9, "lam": 0.8, "lr_schedule": lambda _: 0.0, "clip_range": 0.2}
+    loaded = WPT.load(tmp_path / "model", custom_objects=custom, lam=0.7)
+    assert (loaded.gamma, loaded.lam) == (0.9, 0.7)  # a keyword of `load` comes first
 
 
 @pytest.mark.parametrize("side", [64, 32])

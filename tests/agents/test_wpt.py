@@ -20,6 +20,7 @@ from debug_agent import (
 )
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_env import LENGTH, DotEnv
 
@@ -75,6 +76,17 @@ def test_equal_seeds_give_equal_weights_and_others_do_not(store):
     )
     assert same(weights(one), weights(same_seed))
     assert not same(weights(one), weights(other))
+
+
+def test_sb3s_seed_of_all_generators_makes_agents_without_a_seed_repeatable():
+    def learned(seed):
+        set_random_seed(seed)
+        env = DotEnv()
+        env.reset(seed=0)
+        return weights(agent(env, seed=None).learn(2 * LENGTH))
+
+    one = learned(0)
+    assert same(one, learned(0)) and not same(one, learned(1))
 
 
 def test_a_reseeded_model_draws_anew():

@@ -361,6 +361,12 @@ def test_info_counts(tmp_path):
     assert info["compression"] > 2
 
 
+def test_a_dataset_is_printed_with_its_content(tmp_path):
+    text = repr(made(tmp_path, chain(20, embodiment="a"), chain(30)))
+    words = "2 trajectories, 50 transitions, robots: a, unnamed, actions: 2>"
+    assert text.startswith("<TrajectoryDataset '") and text.endswith(words)
+
+
 def test_sources_and_tasks_are_told_and_counted(tmp_path):
     dataset = made(tmp_path, chain(4, source="ours", task="run"), chain(4, task="run"), chain(4))
     assert dataset.sources == ["ours", None, None]

@@ -481,6 +481,26 @@ def test_an_episode_that_cannot_be_converted_is_left_out_as_the_error_says(tmp_p
         convert(tmp_path / "three", skip=[4])
 
 
+def test_one_error_names_all_episodes_that_cannot_be_converted(tmp_path):
+    for i in range(6):
+        save_npz(tmp_path / f"in/{i}.npz", chain(5 + i, i))
+    for name in ("0", "2", "5"):
+        (tmp_path / f"in/{name}.npz").write_bytes(b"damaged")
+    convert = partial(TrajectoryDataset.from_npz, tmp_path / "in", tmp_path / "out", **SMALL)
+    remedy = r"0\.npz is damaged .* 2 after it .* skip=\[0, 2, 5\] \(--skip=0,2,5\) leaves them out"
+    with pytest.raises(ValueError, match=remedy):
+        convert()
+    assert convert(skip=[0, 2, 5]).lengths.tolist() == [6, 8, 9]
+
+
+def test_an_option_that_suits_no_episode_does_not_suggest_to_skip_all(tmp_path):
+    for i in range(3):
+        save_npz(tmp_path / f"in/{i}.npz", chain(5, i))
+    with pytest.raises(ValueError) as error:
+        TrajectoryDataset.from_npz(tmp_path / "in", tmp_path / "out", image_key="top", **SMALL)
+    assert "skip" not in str(error.value)
+
+
 def test_pretraining_takes_whatever_can_be_read(tmp_path, cache, monkeypatch):
     pictures = [chain(9, 0, size=64), chain(8, 1, size=64)]
     save_npz(tmp_path / "npz/0.npz", pictures[0])

@@ -38,6 +38,7 @@ FILES = {  # what the folder holds, which path is opened, what the message says
     "x.bag": [("x.bag", r"no format that can be imported \(hdf5, lerobot, .*zarr\); make a Traj")],
     "s.hdf": [("s.hdf", r"may be an HDF5 file, .*name the format: `.* import hdf5 .*s\.hdf DST`")],
     "a/b-train.array_record-00000-of-00001": [("a", "array_record files.*file_format=tfrecord")],
+    "data/arm/meta.json": [("data", r"folder of datasets, .* their list: \['.*data/arm'\]")],
     "notes/readme.txt": [("notes", r"meta\.json is missing, .* there are: readme\.txt\. You can")],
 }
 

@@ -76,6 +76,14 @@ def test_the_main_camera_of_robomimic_is_taken_and_another_can_be_named(tmp_path
         check(hand, old)
 
 
+def test_a_second_camera_of_an_unusual_name_is_named_but_depths_are_not(tmp_path):
+    save_robomimic(tmp_path / "a.hdf5", [chain(6)], cameras=("agentview_image", "eye_in_hand"))
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["data/demo_0/obs/agentview_depth"] = np.zeros((6, 8, 8, 1), np.float32)
+    with pytest.warns(UserWarning, match=r"'obs/agentview_image' is used\. .*: obs/eye_in_hand$"):
+        open_episodes(tmp_path / "a.hdf5", **SMALL)
+
+
 def test_libero_names_its_task_in_words(tmp_path):
     save_robomimic(tmp_path / "a.hdf5", [chain(5)], False, ("agentview_rgb",))
     with h5py.File(tmp_path / "a.hdf5", "a") as file:

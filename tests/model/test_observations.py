@@ -1,5 +1,7 @@
 """What `predict` takes for an observation, an episode's start and a recurrent state."""
 
+import re
+
 import numpy as np
 import pytest
 from debug_agent import agent, noise
@@ -40,6 +42,20 @@ def test_the_image_of_a_dictionary_is_found_or_chosen():
 def test_floats_are_refused_with_their_range():
     with pytest.raises(ValueError, match=r"\(64, 64, 3\) float64 with values from 0 to 1"):
         to_images(np.eye(64)[..., None] * np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("image", "remedy"),
+    [
+        (np.full((64, 64, 3), 0.5), r"np.rint(255 * image).astype(np.uint8)"),
+        (np.full((64, 64, 3), 9.0), r"np.rint(image).astype(np.uint8)"),
+        (np.zeros((64, 64), np.uint8), r"np.repeat(image[..., None], 3, axis=-1)"),
+        (np.zeros(7), "render the environment to pixels"),
+    ],
+)
+def test_what_is_no_image_is_refused_with_the_line_that_makes_one(image, remedy):
+    with pytest.raises(ValueError, match=re.escape(remedy)):
+        to_images(image)
 
 
 def test_the_whole_result_of_reset_is_refused_with_the_line_that_helps():

@@ -177,6 +177,19 @@ def test_an_unknown_name_lists_the_nearest(call, words):
         call()
 
 
+@pytest.mark.parametrize(
+    ("keyword", "words"),
+    [
+        ("gradient_steps", "as in Stable-Baselines3: use 'train_ratio' instead. It counts"),
+        ("policy_kwargs", "use 'size' instead"),
+        ("buffer_size", "leave 'buffer_size' out. The replay buffer keeps every episode"),
+    ],
+)
+def test_a_keyword_of_sb3_is_answered_with_its_replacement(keyword, words):
+    with pytest.raises(TypeError, match=words):
+        agent(**{keyword: 3})
+
+
 def test_load_refuses_unknown_keywords(tmp_path):
     agent().save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"No keyword 'ent_coeff'\. Did you mean 'ent_coef'"):

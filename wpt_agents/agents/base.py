@@ -196,9 +196,9 @@ class PixelAgent(SavedAgent):
         while go_on and not ended and self.unfinished:
             self.before_step()
             image, _ = to_images(self._last_obs)
-            action = self.policy.to_env(rollout.act(image))
+            actions = self.policy.to_env(rollout.act(image))  # named as callbacks of SB3 expect
             meanwhile = self.update_models if self.hyperparameters.train_freq == "step" else None
-            new_obs, rewards, dones, infos = step_all(self.env, action, meanwhile)
+            new_obs, rewards, dones, infos = step_all(self.env, actions, meanwhile)
             check_rewards(rewards, self.num_timesteps)  # before anything of this step is recorded
             self.num_timesteps += self.n_envs
             if self.warmup_pays or self.num_timesteps > self.learning_starts:

@@ -5,7 +5,6 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -14,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, unwrap_vec_normalize
 
 from wpt_agents.agents.attributes import declare
+from wpt_agents.agents.sb3_keywords import unknown_keyword
 from wpt_agents.data.convert import Data, open_dataset
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.replay import ReplayBuffer
@@ -23,7 +23,7 @@ from wpt_agents.training.checks import check_device
 from wpt_agents.training.environments import as_vec_env
 from wpt_agents.training.keywords import Keywords, Stage
 from wpt_agents.training.progress import Progress
-from wpt_agents.training.randomness import Streams, torch_seed
+from wpt_agents.training.randomness import Streams, free_seed
 from wpt_agents.training.resets import resets
 from wpt_agents.training.rollout import Rollout
 from wpt_agents.training.spaces import check_spaces
@@ -90,14 +90,14 @@ class ConfiguredAgent(BaseAlgorithm):
         **keywords: Any,
     ) -> None:
         if unknown := keywords.keys() - self.keywords.declared().keys():
-            raise TypeError(str(unknown_name("keyword", min(unknown), self.keywords.declared())))
+            raise unknown_keyword(min(unknown), self.keywords.declared())
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise unknown_name("policy", policy, self.policy_aliases)
         check_device(device)
         self.hyperparameters = self.keywords(**keywords)
         self.progress = self.progress_class()
         seed = self.hyperparameters.seed
-        self.streams = Streams(torch_seed(np.random.default_rng()) if seed is None else seed)
+        self.streams = Streams(free_seed() if seed is None else seed)
         super().__init__(
             policy or next(iter(self.policy_aliases)),
             None,

@@ -70,7 +70,8 @@ class SavedAgent(ConfiguredAgent):
             with the library, such as "metaworld-mid"
         :param env: the environment to continue with
         :param device: "auto", "cpu", "cuda", ...
-        :param custom_objects: ignored; accepted because SB3 has it
+        :param custom_objects: as in SB3, values that replace those in the file; names that are no
+            keywords of this agent, such as `lr_schedule`, are ignored
         :param print_system_info: print this system's versions, as SB3 does
         :param force_reset: reset the environment at the next call of `learn`
         :param kwargs: new values for keywords of the constructor, also `dataset`
@@ -78,6 +79,8 @@ class SavedAgent(ConfiguredAgent):
         :raises FileNotFoundError: no such file; for a folder, the message lists the files in it
         """
         path = model_files.find(path)
+        declared = cls.keywords.declared()
+        kwargs = {k: v for k, v in (custom_objects or {}).items() if k in declared} | kwargs
         cls.check_keywords(kwargs)
         if print_system_info:
             get_system_info()

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import Source, TrajectoryDataset
+from wpt_agents.data.importers.damaged import converted
 from wpt_agents.data.importers.episodes import Episodes
 from wpt_agents.data.importers.formats import FORMATS, NAMES, open_episodes, recognise
 from wpt_agents.data.importers.lerobot import LeRobotEpisodes
@@ -193,7 +194,7 @@ def from_episodes(
             done = _count_done(dataset, episodes, path)
         with StageBar(len(episodes), "convert", progress_bar, done, " episodes") as bar:
             for i in range(done, len(episodes)):
-                trajectory = _converted(episodes, i)
+                trajectory = converted(episodes, i)
                 dataset.append(trajectory)
                 ranges.add(trajectory)
                 bar.update()
@@ -210,23 +211,10 @@ def _count_done(dataset: TrajectoryDataset, episodes: Episodes, path: Source) ->
     known = done > 0 and len(dataset) == done  # otherwise the last one may be set aside
     if done > len(episodes) or (known and not _same(dataset, episodes[done - 1])):
         raise ValueError(
-            f"{path} holds {done} trajectories of another source or with other labels; "
-            "convert to another folder"
+            f"{path} holds {done} trajectories of another source, from another camera or other "
+            "limits, or with other labels; convert to another folder"
         )
     return done
-
-
-def _converted(episodes: Episodes, i: int) -> Trajectory:
-    try:
-        return episodes[i]
-    except ValueError as error:
-        if i == 0:  # what is wrong with the first one may be wrong with all
-            raise
-        number = episodes.number(i)
-        raise ValueError(
-            f"{error}. The episodes before it are converted; skip=[{number}] (--skip={number}) "
-            "leaves this one out"
-        ) from error
 
 
 def _same(dataset: TrajectoryDataset, read: Trajectory) -> bool:

@@ -78,6 +78,15 @@ class TrajectoryDataset(StoredTrajectories):
         self._writer: Writer | None = None
         self._resize = Resizer(self.image_size, crop_option="append(trajectory, crop=True)")
 
+    def __repr__(self) -> str:
+        """The folder, counts, robots and the numbers of their actions."""
+        robots = sorted({name or "unnamed" for name in self.embodiments})
+        return (
+            f"<{type(self).__name__} {str(self.path)!r}: {len(self)} trajectories, "
+            f"{int(self.lengths.sum())} transitions, robots: {', '.join(robots)}, "
+            f"actions: {', '.join(map(str, sorted(set(self.action_dims))))}>"
+        )
+
     @classmethod
     def create(
         cls,

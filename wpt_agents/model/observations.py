@@ -67,8 +67,8 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
     if axis is None or images.dtype != np.uint8:
         raise ValueError(
             f"An observation must be an image, (H, W, 3) uint8 or a batch of them, got "
-            f"{observation.shape} {observation.dtype}{_range(observation)}; render the environment "
-            "to pixels"
+            f"{observation.shape} {observation.dtype}{_range(observation)}; "
+            f"{_remedy(observation, axis is not None)}"
         )
     if axis == 0:
         images = images.transpose(0, 2, 3, 1)
@@ -77,6 +77,19 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
     if images.shape[1:3] != (IMAGE_SIZE, IMAGE_SIZE):
         images = resized(images, IMAGE_SIZE)
     return np.require(images, requirements=("C", "W")), batched
+
+
+def _remedy(observation: np.ndarray, shaped: bool) -> str:
+    """Return how to make an image of what is not one.
+
+    :param shaped: whether it has the shape of an image, or of a batch
+    """
+    if not shaped and observation.ndim == 2 and min(observation.shape) >= 16:
+        return "repeat a grayscale image, np.repeat(image[..., None], 3, axis=-1)"
+    if not shaped or observation.dtype.kind not in "fiu":
+        return "render the environment to pixels"
+    small = observation.dtype.kind == "f" and observation.size and observation.max() <= 1
+    return f"convert it, np.rint({'255 * image' if small else 'image'}).astype(np.uint8)"
 
 
 def _key_of(observation: Mapping[str, Any], image_key: str | None) -> str:

@@ -64,6 +64,11 @@ class Streams:
         return torch_seed(self.numpy(purpose, counter))
 
 
+def free_seed() -> int:
+    """Return a seed for an agent without one; SB3's `set_random_seed` makes it repeatable."""
+    return int(np.random.randint(2**31))
+
+
 def torch_seed(rng: np.random.Generator) -> int:
     """Return a seed for torch's generators."""
     return int(rng.integers(2**31))  # what every generator accepts as a seed

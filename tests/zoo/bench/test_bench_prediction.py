@@ -225,6 +225,16 @@ def test_open_loop_compares_the_model_with_the_simplest_guesses(pre_trained):
     assert copied["clock 2"]["+10"] == pytest.approx(PIXELS * (20 / 255) ** 2, abs=0.1)
 
 
+def test_open_loop_names_the_robots_whose_trajectories_are_too_short(pre_trained):
+    model = WPT.load(pre_trained / "model.zip")
+    with TrajectoryDataset.open(pre_trained / "data") as more:
+        more.append(clock(20, speed=3))
+    data = TrajectoryDataset.open(pre_trained / "data")
+    with pytest.warns(UserWarning, match=r"No trajectory of clock 3 is long enough .*open_loop"):
+        rows = list(prediction.judge({"world model": model}, data, episodes=2))
+    assert {row["robot"] for row in rows} == {"clock 1", "clock 2"}
+
+
 def test_open_loop_draws_and_refuses_what_is_too_short_or_wide(pre_trained):
     words = ["open-loop", str(pre_trained), str(pre_trained / "data")]
     ran = CliRunner().invoke(app, [*words, "--out", str(pre_trained / "seen")])

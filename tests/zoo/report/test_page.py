@@ -176,6 +176,16 @@ def test_every_run_shows_its_command_seed_commit_and_the_first_its_pictures(page
     assert page.count("what was retrieved") == 2
 
 
+def test_a_suite_and_a_method_that_were_added_are_on_the_page_under_their_names(tmp_path):
+    for seed in range(2):
+        for method, low in (("mine", 9.0), ("scratch", 0.0), ("wpt", 0.0)):
+            make_run(tmp_path, "dots-left", seed, method, (low, 10.0))
+    write_page(tmp_path, tmp_path / "index.html")
+    page = (tmp_path / "index.html").read_text()
+    assert "<h2>dots</h2>" in page
+    assert "wpt scratch 0.50 1 wpt mine 0.00 1 mine scratch 1.00 1" in text(page)
+
+
 @pytest.mark.parametrize(("media", "videos"), [("all", 6), ("none", 0)])
 def test_how_many_videos_the_page_holds_is_ones_choice(runs, media, videos):
     write_page(runs, runs / "index.html", media)

@@ -75,6 +75,17 @@ def test_untrained_policies_are_told_apart_by_how_they_are_played(tmp_path):
     assert lines == ["debug", "demo", "demo evaluate.episodes=3"]
 
 
+def test_only_intervals_of_success_rates_end_at_0_and_100():
+    def low(suite):
+        lines = [line("wpt", score, seed=i, suite=suite) for i, score in enumerate((1, 9, 2))]
+        [cells] = record_tables.by_task(lines).values()
+        [cell] = cells.values()
+        return str(cell).split(" to ")[0].split("(")[1]
+
+    assert low("metaworld") == low("robotics") == "0.00*"
+    assert float(low("returns-of-your-own")) < 0
+
+
 def test_budgets_are_kept_apart_where_there_is_no_run_of_wpt():
     lines = [line("scratch", 10.0, frames=100), line("scratch", 90.0, frames=300)]
     lines += [line("scratch", 50.0, frames=900, preset="small"), line("random", 1.0, frames=0)]

@@ -210,6 +210,29 @@ def test_rows_leave_out_changed_settings_and_show_the_papers_score_hollow():
     ]
 
 
+def added():
+    """Lines of a suite and a method that were added to the zoo."""
+    scores = {"scratch": (10.0, 20.0), "mine": (30.0, 15.0), "random": (0.0, 0.0)}
+    return [
+        line(method, task, score, suite="dots")
+        for method, by_task in scores.items()
+        for task, score in zip(("left", "right"), by_task, strict=True)
+    ]
+
+
+def test_a_method_that_was_added_is_compared_with_the_others():
+    [pair] = pairs.pairs(added())
+    assert (pair.where, pair.first, pair.second) == ("dots", "mine", "scratch")
+    assert pair.differences == [20.0, -5.0]
+
+
+def test_where_the_paper_has_no_scores_none_are_mentioned():
+    [one] = evidence.evidence(added())
+    assert "paper" not in evidence.explanation(one)
+    assert "paper" not in record_picture.draw_panels(added())._supxlabel.get_text()
+    assert "paper" in record_picture.draw_panels(LINES)._supxlabel.get_text()
+
+
 def test_negative_scores_of_hard_tasks_are_within_the_picture():
     hard = [line("random", "walker-walk-hard", -14.0, frames=0, suite="dmc")]
     hard += [line("wpt", "walker-walk-hard", 88.0, suite="dmc")]

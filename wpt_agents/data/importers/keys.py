@@ -66,6 +66,11 @@ def is_images(array: Any) -> bool:
     return dims == 4 or (dims == 3 and array.dtype == np.uint8) or is_encoded(array)
 
 
+def is_colour(array: Any) -> bool:
+    """Return whether an array of images is one of colour images, not of depths or masks."""
+    return is_encoded(array) or (len(array.shape) == 4 and 3 in (array.shape[1], array.shape[3]))
+
+
 def is_encoded(array: Any) -> bool:
     """Return whether each row is a PNG or JPEG file: bytes, or (N, L) uint8 padded with zeros."""
     dims = len(array.shape)
@@ -155,7 +160,8 @@ def _find_images(table: Table, image_key: str | None) -> tuple[str, tuple[str, .
     main = [name for name in cameras if leaf(name) in MAIN_CAMERAS]
     for choice in (cameras, main):
         if len(choice) == 1:
-            return choice[0], tuple(name for name in cameras if name != choice[0])
+            colour = [name for name in pictures if is_colour(table[name])]
+            return choice[0], tuple(name for name in colour if name != choice[0])
     raise ValueError(f"the images have no usual name; {ask}" if pictures else ask)
 
 

@@ -176,6 +176,12 @@ def _folder(path: Path, formats: str) -> str:
         )
     if not names:
         return f"is empty; pass a folder with data ({formats})"
+    datasets = [name for name in names if (path / name / "meta.json").exists()]
+    if datasets:
+        listed = ", ".join(repr(str(path / name)) for name in datasets)
+        return (
+            f"is a folder of datasets, not one itself; pass one of them, or their list: [{listed}]"
+        )
     if next(files_below(path, "*.pt"), None):
         return (
             "is not a dataset: it holds .pt files of torch; if they are TD-MPC2's data with "

@@ -5,6 +5,7 @@ squared, summed over an image whose values lie in [-0.5, 0.5].
 """
 
 import csv
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,12 +64,7 @@ def judge(
     ways: dict[str, dict[str, Predict]] = {}
     tests: dict[str, list[Batch]] = {}
     names = np.array([name or "unnamed" for name in dataset.embodiments])
-    long = np.asarray(dataset.lengths) + 1 >= CONTEXT + HORIZON
-    if not long.any():
-        raise ValueError(
-            f"The longest trajectory of {dataset.path} has {max(dataset.lengths) + 1} images, but "
-            f"{CONTEXT} observed and {HORIZON} predicted ones are needed: use longer episodes"
-        )
+    long = _long_enough(dataset, names)
     for robot in dict.fromkeys(names[long].tolist()):
         candidates = np.flatnonzero(long & (names == robot))
         number = min(episodes, len(candidates))
@@ -86,6 +82,29 @@ def judge(
         }
     shown = [(robot, robot, list(models)) for robot in ways]
     return compare(ways, tests, folder, shown)
+
+
+def _long_enough(dataset: TrajectoryDataset, names: np.ndarray) -> np.ndarray:
+    """Return which trajectories have enough images; warn about robots that have none such.
+
+    :raises ValueError: there is none of any robot
+    """
+    need = f"{CONTEXT} observed and {HORIZON} predicted ones are needed"
+    fewer = "for shorter episodes, use `model.open_loop(trajectory, context, horizon)` in Python"
+    long = np.asarray(dataset.lengths) + 1 >= CONTEXT + HORIZON
+    if not long.any():
+        raise ValueError(
+            f"The longest trajectory of {dataset.path} has {max(dataset.lengths) + 1} images, but "
+            f"{need}; {fewer}"
+        )
+    short = [name for name in dict.fromkeys(names.tolist()) if not long[names == name].any()]
+    if short:
+        warnings.warn(
+            f"No trajectory of {', '.join(short)} is long enough ({need}), so the table does not "
+            f"show it; {fewer}",
+            stacklevel=3,
+        )
+    return long
 
 
 def compare(

@@ -13,7 +13,7 @@ from wpt_agents.files.names import counted
 from wpt_agents.zoo.numbers import interval_text, number
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, normalised, printed_scores
-from wpt_agents.zoo.report.headline import SUITES
+from wpt_agents.zoo.report.headline import suite_title
 from wpt_agents.zoo.report.record import place
 from wpt_agents.zoo.report.record_tables import OURS, column, usual_budgets
 from wpt_agents.zoo.report.tables import markdown_table
@@ -118,10 +118,7 @@ def paper_scores(suite: str) -> dict[str, dict[str, float]]:
 def markdown(lines: Sequence[Line]) -> str:
     """Return a table for each suite, with a sentence about what it compares."""
     suites = evidence(lines)
-    parts = [
-        f"## {SUITES.get(one.suite, one.suite)}\n\n{explanation(one)}\n{table(one)}"
-        for one in suites
-    ]
+    parts = [f"## {suite_title(one.suite)}\n\n{explanation(one)}\n{table(one)}" for one in suites]
     shown = {task for one in suites for task in one.tasks}
     if changed := sorted({line.task for line in lines if line.frames} - shown):
         parts.append(
@@ -134,11 +131,14 @@ def markdown(lines: Sequence[Line]) -> str:
 def explanation(one: Evidence) -> str:
     """Return the explanation of a table's columns and its last row."""
     unit = UNITS.get(one.suite, " or ".join(UNITS.values()))
+    published = any(task in scores for scores in one.paper.values() for task in one.tasks)
     text = (
         f"A score is {unit}, averaged over seeds; if there are several, their number is in "
         f"brackets. The column of a method shows its last policy after {one.frames:,} frames with "
-        f"the unchanged preset `{one.preset}`. The paper's columns are at {PAPER_BUDGET:,} frames. "
+        f"the unchanged preset `{one.preset}`. "
     )
+    if published:
+        text += f"The paper's columns are at {PAPER_BUDGET:,} frames. "
     if any(f"{name}, last" in one.scores for name in one.scores):
         text += (
             "If there is a column `METHOD, last`, that is the last policy, and the column `METHOD` "
@@ -149,7 +149,7 @@ def explanation(one: Evidence) -> str:
         "number of these tasks and, from three tasks on, the 95 % interval by a bootstrap over "
         "tasks."
     )
-    if one.ours is not None:
+    if published and one.ours is not None:
         text += f" In the paper's columns, only tasks with a score of `{one.ours}` count."
     if one.with_gap:
         text += f' The row "mean, with a gap" averages over the tasks {GAP}.'

@@ -23,6 +23,11 @@ COMPARED = {  # a policy's label on the page, and its `policy_name`
 Policies = dict[str, dict[int, float]]  # name -> seed -> score
 
 
+def suite_title(suite: str) -> str:
+    """Return the title of a suite; a suite that was added has its name as title."""
+    return SUITES.get(suite, suite)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """The number of tasks on which WPT's interval lies above or below another policy's."""
@@ -58,7 +63,7 @@ def headlines(results: Sequence[Result]) -> list[Headline]:
                 continue  # other methods have the same prior actor with other seeds
             task.setdefault(name, {})[result.seed] = result.counted(policy)
     return [
-        Headline(SUITES[suite], preset, frames, compare(list(tasks.values())))
+        Headline(suite_title(suite), preset, frames, compare(list(tasks.values())))
         for (suite, preset, frames), tasks in groups.items()
         if any(OURS in task for task in tasks.values())
     ]

@@ -35,6 +35,12 @@ MEANINGS = {  # of the methods, for readers who have not seen the documentation
 }
 
 
+def is_added(name: str) -> bool:
+    """Return whether a policy is of a method that was added to those of the library."""
+    method, comma, _ = name.partition(",")
+    return not comma and method not in MEANINGS and method not in (*UNTRAINED, PRIOR_ACTOR)
+
+
 def policy_name(result: Result, policy: str) -> str:
     """Return 'wpt', 'wpt, last', 'prior actor', 'prior actor, no-pretrain', 'random'.
 

@@ -7,6 +7,7 @@ from statistics import fmean
 from wpt_agents.zoo.numbers import interval_text, number
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.evidence import GAP, Evidence, evidence, task_interval
+from wpt_agents.zoo.report.names import MEANINGS, is_added
 from wpt_agents.zoo.report.tables import markdown_table
 from wpt_agents.zoo.result import PRIOR_ACTOR
 from wpt_agents.zoo.statistics import sign_test
@@ -91,7 +92,7 @@ def pairs(lines: Sequence[Line]) -> list[Pair]:
     """
     suites = evidence(lines)
     compared = []
-    for first, second in PAIRS:
+    for first, second in (*PAIRS, *_pairs_of_added(suites)):
         by_suite = [pair for one in suites for pair in comparisons(one, first, second)]
         compared += by_suite
         for kind in dict.fromkeys(kind_of(pair) for pair in by_suite):
@@ -100,6 +101,14 @@ def pairs(lines: Sequence[Line]) -> list[Pair]:
                 every = tuple(scores for pair in same for scores in pair.scores)
                 compared.append(Pair(f"all{kind}", first, second, every))
     return compared
+
+
+def _pairs_of_added(suites: Sequence[Evidence]) -> list[tuple[str, str]]:
+    """Return each method that was added to the zoo with every other method and the prior actor."""
+    names = list(dict.fromkeys(name for one in suites for name in one.scores))
+    added = [name for name in names if is_added(name)]
+    others = [name for name in names if name in (PRIOR_ACTOR, *MEANINGS)]
+    return [(name, other) for i, name in enumerate(added) for other in (*others, *added[i + 1 :])]
 
 
 def kind_of(pair: Pair) -> str:

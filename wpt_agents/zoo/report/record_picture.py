@@ -20,7 +20,7 @@ from wpt_agents.zoo.pictures.style import plt
 from wpt_agents.zoo.record_lines import Line
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET
 from wpt_agents.zoo.report.evidence import Evidence, evidence, paper_scores, usual_lines
-from wpt_agents.zoo.report.headline import SUITES
+from wpt_agents.zoo.report.headline import suite_title
 from wpt_agents.zoo.report.record import order
 from wpt_agents.zoo.report.record_tables import Cell, Key, by_task
 from wpt_agents.zoo.result import HEAD_START, IMITATION, LAST, NOTHING
@@ -166,7 +166,7 @@ def _draw_suite(panel: Axes, one: Evidence, styles: dict[str, Style]) -> None:
     panel.tick_params("y", labelsize=8.5, length=0)
     every = (one.scores[name][task].values() for name in names for task in one.scores[name])
     panel.set(xlim=(least(chain(*every), -3), 103), ylim=(len(rows) - 0.5, -0.5))
-    panel.set_title(SUITES.get(one.suite, one.suite), fontsize=10)
+    panel.set_title(suite_title(one.suite), fontsize=10)
     panel.grid(axis="x", lw=0.4)
     panel.spines[["top", "right", "left"]].set_visible(False)
 
@@ -188,8 +188,10 @@ def draw_panels(lines: Sequence[Line]) -> Figure:
         _draw_panel(panel, task.removeprefix(f"{suite}-"), rows)
     for panel in panels.flat[len(tasks) :]:
         panel.remove()
-    explained = "a dot per seed, a stroke at their mean;", "hollow: the paper's"
-    space = " " if columns > 1 else "\n"  # a single panel is narrow
+    explained = ["a dot per seed, a stroke at their mean"]
+    if any(row.style is None for rows in tasks.values() for row in rows):
+        explained.append("hollow: the paper's")
+    space = "; " if columns > 1 else ";\n"  # a single panel is narrow
     figure.supxlabel(f"score, 0 to 100\n{space.join(explained)}", fontsize=9)
     return figure
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
+from wpt_envs.tasks import TASKS
 
 from wpt_agents.zoo.numbers import ANY, PERCENT, Range, interval_text, number
 from wpt_agents.zoo.record_lines import Line
@@ -57,12 +58,15 @@ def by_task(lines: Iterable[Line]) -> dict[tuple[str, str], dict[Key, Cell]]:
     for line in lines:
         scores[line.suite, line.task][Key(line.method, line.preset, line.frames)].append(line.score)
     return {
-        (suite, task): {
-            key: Cell.of(values, ANY if suite == "dmc" else PERCENT)
-            for key, values in methods.items()
-        }
+        (suite, task): {key: Cell.of(values, _possible(suite)) for key, values in methods.items()}
         for (suite, task), methods in scores.items()
     }
+
+
+def _possible(suite: str) -> Range:
+    """Return the range of a suite's scores, which cuts off the ends of intervals."""
+    metrics = {task.metric for task in TASKS.values() if task.suite == suite}
+    return PERCENT if metrics == {"success"} else ANY
 
 
 class Means(NamedTuple):

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from wpt_envs.tasks import TASKS
@@ -12,7 +12,8 @@ from wpt_agents.zoo.plan.methods import ABLATION
 from wpt_agents.zoo.report import aggregates, figures
 from wpt_agents.zoo.report.aggregates import PAPER_BUDGET, Aggregate, Estimate, Experiment
 from wpt_agents.zoo.report.folders import Finished
-from wpt_agents.zoo.report.headline import OURS, SUITES
+from wpt_agents.zoo.report.headline import OURS, suite_title
+from wpt_agents.zoo.report.names import is_added
 from wpt_agents.zoo.statistics import bootstrap, mean, performance_profile, resamplable
 
 Scores = dict[str, list[float]]  # task -> normalised scores of its runs
@@ -67,8 +68,9 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class Improvement:
-    """The probability that wpt improves on another experiment, over the tasks in common."""
+    """The probability that a method improves on another, over the tasks in common."""
 
+    method: str
     over: str
     estimate: Estimate
     tasks: int
@@ -107,7 +109,7 @@ def section(suite: str, runs: Sequence[Finished], names: Names) -> Section:
     results = [run.result for run in of_suite]
     experiments = aggregates.by_experiment(results)
     return Section(
-        name=SUITES[suite],
+        name=suite_title(suite),
         names=list(dict.fromkeys(map(names, experiments))),
         all_names=names.all,
         tasks=sum(row.suite == suite and row.in_paper for row in TASKS.values()),
@@ -148,14 +150,19 @@ def paper_rows(suite: str, tasks: set[str]) -> list[PaperRow]:
 
 
 def improvements(experiments: Mapping[Experiment, Scores], names: Names) -> list[Improvement]:
-    """Compare wpt with each other method of the same preset and budget."""
+    """Compare wpt and added methods with each other one of the same preset and budget."""
     rows = []
-    for one, theirs in experiments.items():
-        wpt = Experiment(one.suite, one.variant, one.frames, OURS)
-        if one.method == OURS or wpt not in experiments:
+    done: list[set[Experiment]] = [{one} for one in experiments]
+    for first in sorted(experiments, key=lambda one: one.method != OURS):
+        if first.method != OURS and not is_added(first.method):
             continue
-        if compared := aggregates.improvement(experiments[wpt], theirs):
-            rows.append(Improvement(names(one), *compared))
+        for second in experiments:
+            alike = replace(second, method=first.method) == first
+            if not alike or {first, second} in done:
+                continue
+            done.append({first, second})
+            if compared := aggregates.improvement(experiments[first], experiments[second]):
+                rows.append(Improvement(names(first), names(second), *compared))
     return rows
 
 
@@ -173,7 +180,7 @@ def profile(suite: str, experiments: Mapping[Experiment, Scores], names: Names) 
         if resamplable(scores):
             ends = bootstrap(shares, scores, draws=2000)
         lines.append(figures.Line(names(one), THRESHOLDS, (middle, *ends)))
-    title = f"{SUITES[suite]}: performance profile"
+    title = f"{suite_title(suite)}: performance profile"
     return figures.lines(
         title, "normalised score τ", "share of runs > τ", lines, names.all, step=True
     )
@@ -207,7 +214,7 @@ def draw_ablation(
             scores = [np.array(s) for task, s in experiments[one].items() if task in common]
             values[part] = aggregates.estimate(mean, scores)
             colours.append(figures.colour_of(names(one), names.all))
-    title = f"{SUITES[suite]}: ablation, {budget}"
+    title = f"{suite_title(suite)}: ablation, {budget}"
     return figures.bars(title, f"normalised mean, tasks: {len(common)}", values, colours)
 
 

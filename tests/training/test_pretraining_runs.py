@@ -1,6 +1,7 @@
 """Pre-training leaves a curve, and whatever stops it loses nothing."""
 
 import csv
+import fcntl
 import os
 import shutil
 import signal
@@ -222,6 +223,17 @@ def test_a_table_of_version_0_1_goes_on(tmp_path):
     table.write({"train/kl": 4.5, STEP: 6}, {"train/kl": (), STEP: ()}, 6)
     table.close()
     assert path.read_text() == f"train/kl,{STEP}\n1.5,\n2.5,\n4.5,6\n"
+
+
+def test_a_folder_in_which_another_process_trains_is_refused(tmp_path):
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(ValueError, match="Another process trains in run_dir="):
+        pretrain(tmp_path)
+    assert not list(tmp_path.iterdir())
+    os.close(descriptor)
+    assert pretrain(tmp_path, steps=2).pretrain_steps == 2
+    assert pretrain(tmp_path, steps=4).pretrain_steps == 4  # the first one released its lock
 
 
 def test_a_folder_that_has_all_updates_already_says_so(tmp_path):

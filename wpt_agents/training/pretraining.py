@@ -1,8 +1,9 @@
 """// Task-Agnostic World Model Pre-Training of Algorithm 1, on one device or many."""
 
+import os
 import warnings
 from collections.abc import Callable, Generator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -11,6 +12,7 @@ import numpy as np
 from wpt_agents.data.bars import StageBar
 from wpt_agents.data.dataset import TrajectoryDataset
 from wpt_agents.data.trajectory import Batch
+from wpt_agents.files.locks import lock
 from wpt_agents.training.distributed import World
 from wpt_agents.training.divided import Divided
 from wpt_agents.training.hyperparameters import Hyperparameters
@@ -128,6 +130,7 @@ class Pretraining:
         self.world = world or World()
         self.signals = StopSignals()
         self.log: PretrainingLog | None = None
+        self.unlock = ExitStack()
 
     def __enter__(self) -> Self:
         agent = self.agent
@@ -149,6 +152,7 @@ class Pretraining:
     def __exit__(self, *_: object) -> None:
         if self.log is not None:
             self.log.close()
+        self.unlock.close()
         self.signals.__exit__()
 
     def finish_update(self, metrics: Metrics) -> None:
@@ -157,6 +161,7 @@ class Pretraining:
         progress = agent.progress
         if self.log is None and self.world.rank == 0:  # not sooner: a refusal leaves no files
             before = progress.pretrain_steps
+            self._lock()
             self.log = PretrainingLog(self.run_dir, agent.tensorboard_log, agent.verbose, before)
         progress.pretrain_steps += 1
         step = progress.pretrain_steps
@@ -174,6 +179,23 @@ class Pretraining:
             self.world.barrier()  # no process goes on, or ends, before the file is there
         if stop:
             self.signals.deliver(stop)
+
+    def _lock(self) -> None:
+        """Refuse a run folder in which another process trains."""
+        if self.run_dir is None:
+            return
+        self.run_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.run_dir, os.O_RDONLY)
+        self.unlock.callback(os.close, descriptor)
+        try:
+            lock(descriptor)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"Another process trains in run_dir={self.run_dir}: wait for it, or pass another "
+                "run_dir"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
 
     def _save(self) -> None:
         if self.log is not None:

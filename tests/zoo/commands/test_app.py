@@ -74,8 +74,8 @@ def test_every_command_has_help(command, monkeypatch, capsys):
 def test_every_suite_runs_without_the_name_of_a_preset(
     suite, preset, monkeypatch, capsys, tmp_path
 ):
-    words = ["run", "--suite", suite, "--dry-run", "--out", tmp_path]
-    assert call(monkeypatch, *words) == 0
+    monkeypatch.chdir(tmp_path)  # a short --out, which the table shows whole
+    assert call(monkeypatch, "run", "--suite", suite, "--dry-run") == 0
     assert f"/{preset}/wpt/" in "".join(capsys.readouterr().out.split())
 
 

@@ -69,9 +69,9 @@ def _warn_of_differences(shared: Shared) -> None:
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: pre-train the model unless it is finished, and return its file."""
-    if model := shared.given_model:
-        say("pretrain", named(model), given_file(model))
-        return given_file(model)
+    if given := shared.given_model:
+        say("pretrain", named(given), given_file(given))
+        return given_file(given)
     folder = shared.model_path
     world = World.current()
     model = folder / "model.zip"

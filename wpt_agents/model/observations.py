@@ -80,7 +80,7 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
 
 
 def _remedy(observation: np.ndarray, shaped: bool) -> str:
-    """Return how to make an image of what is not one.
+    """Return how to convert the values of an observation to an image.
 
     :param shaped: whether it has the shape of an image, or of a batch
     """

@@ -69,9 +69,9 @@ def _warn_of_differences(shared: Shared) -> None:
 
 def pretrain(shared: Shared, dataset: TrajectoryDataset) -> Path:
     """Stage 2: pre-train the model unless it is finished, and return its file."""
-    if given := shared.given_model:
-        say("pretrain", named(given), given_file(given))
-        return given_file(given)
+    if its_model := shared.given_model:
+        say("pretrain", named(its_model), given_file(its_model))
+        return given_file(its_model)
     folder = shared.model_path
     world = World.current()
     model = folder / "model.zip"

@@ -40,6 +40,8 @@ def together(rank, folder, jobs):
         train(folder / "data", run_dir=folder / "killed", **next(iter(jobs.values())))
     except RuntimeError as error:
         (folder / "messages.json").write_text(json.dumps([refused, str(error)]))
+    # gloo's threads must not outlive the interpreter: one that asks for its lock then aborts
+    dist.destroy_process_group()
 
 
 def differing(rank, folder):

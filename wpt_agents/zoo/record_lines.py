@@ -26,6 +26,8 @@ class Line:
     :param model_hash: the first digits of the SHA-256 of the pre-trained model file that
         fine-tuning began with; "" without one, or where unknown
     :param policy: one of `POLICIES`; "" in records of version 0.1
+    :param success_any: the share of episodes with success at any step, where `success` is that
+        with success at the last one; None in older records and without successes
     """
 
     suite: str
@@ -44,6 +46,7 @@ class Line:
     cpu_hours: float | None = None
     model_hash: str = ""
     policy: str = ""
+    success_any: float | None = None
 
     @property
     def run_method(self) -> str:
@@ -67,7 +70,8 @@ class Line:
 
 
 COLUMNS = [field.name.rstrip("_") for field in fields(Line)]
-OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy")  # records of version 0.1 lack them
+# Older records lack these.
+OPTIONAL = ("updates", "cpu_hours", "model_hash", "policy", "success_any")
 
 
 def read(path: Path) -> list[Line]:
@@ -95,6 +99,7 @@ PARSERS: Mapping[str, Callable[[str], Any]] = {
     "hours": float,
     "updates": lambda text: int(text) if text else None,
     "cpu_hours": lambda text: float(text) if text else None,
+    "success_any": lambda text: float(text) if text else None,
 }
 
 

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from run_folders import make_run
@@ -48,6 +49,13 @@ def test_a_line_holds_the_score_of_the_paper_and_the_command(tmp_path):
 def result(method="wpt", preset="tiny", scores=()):
     where = "dmc", "t", method, Variant.parse(preset), 0, 10, 5
     return Result(*where, "return", {policy: Score((1.0,)) for policy in scores})
+
+
+def test_a_line_holds_success_at_the_last_step_and_at_any():
+    scores = {"last": Score((1.0, 2.0), (True, False), (True, True))}
+    run = SimpleNamespace(result=replace(result(), metric="success", scores=scores))
+    (one,) = record.lines_of([run])
+    assert (one.success, one.success_any) == (0.5, 1.0)
 
 
 def test_data_of_ones_own_are_in_the_command():
@@ -123,7 +131,7 @@ def test_a_record_grows_and_replaces_the_same_run(tmp_path):
     ]
     assert path.read_text().splitlines()[0] == (
         "suite,task,method,seed,preset,frames,score,return,success,hours,commit,command,"
-        "updates,cpu_hours,model_hash,policy"
+        "updates,cpu_hours,model_hash,policy,success_any"
     )
 
 

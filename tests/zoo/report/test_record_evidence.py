@@ -1,6 +1,7 @@
 """The pages beside a record: the evidence of each task, the pairs, and the picture."""
 
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from threading import Thread
@@ -73,6 +74,26 @@ def test_each_mean_is_over_the_columns_tasks_and_the_papers_over_those_of_ours()
     assert (mean[6], mean[7]) == ("10.0 (2 tasks)", "20.0 (1 task)")  # scratch, and 3x frames
     # with a gap: drawer-open and hammer, where the paper has 13 33 100 and 7 40 100
     assert (gap[1], gap[3], gap[8]) == ("10.0 (2 tasks)", "100 (2 tasks)", "85.0 (2 tasks)")
+
+
+def test_success_at_any_step_has_a_row_of_the_runs_where_it_is_known():
+    known = {("hammer", 0): 0.75, ("hammer", 1): 0.25, ("drawer-open", 0): 1.0}
+    lines = [
+        replace(one, success_any=known[one.task.removeprefix("metaworld-"), one.seed])
+        if one.method == "wpt+" and not one.preset.changes and "soccer" not in one.task
+        else one
+        for one in LINES
+    ]
+    text = evidence.markdown(lines)
+    head, *_, last = rows(text)
+    assert last[0] == "**mean, success at any step**" and "at any step, where" in text
+    cells = dict(zip(head, last, strict=True))  # ((75 + 25) / 2 + 100) / 2
+    assert (cells["wpt+"], cells["prior actor"], cells["WPT, paper"]) == (
+        "75.0 (2 tasks)",
+        "-",
+        "-",
+    )
+    assert "any step" not in evidence.markdown(LINES)
 
 
 def test_a_gap_needs_both_baselines_low_and_the_papers_wpt_high(monkeypatch):

@@ -4,8 +4,9 @@ Runs with changed settings are excluded here; the table of every run has them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,9 @@ GAP = (
 )
 
 
+Columns = Mapping[str, Mapping[str, Mapping[int, float]]]  # column -> task -> seed -> percentage
+
+
 @dataclass(frozen=True)
 class Evidence:
     """The scores (0 to 100) of a suite's runs with an unchanged preset.
@@ -38,13 +42,16 @@ class Evidence:
     :param frames: the usual budget; a column with another one has it in its name
     :param scores: column -> task -> seed -> score
     :param paper: method -> task -> the paper's score at 150,000 frames
+    :param reached: the percentages of episodes with success at any step, of the runs for which the
+        record has them
     """
 
     suite: str
     preset: Variant
     frames: int
-    scores: Mapping[str, Mapping[str, Mapping[int, float]]]
+    scores: Columns
     paper: Mapping[str, Mapping[str, float]]
+    reached: Columns = field(default_factory=dict)
 
     @property
     def tasks(self) -> list[str]:
@@ -69,7 +76,12 @@ class Evidence:
 
     def means(self, name: str) -> dict[str, float]:
         """Return the mean over seeds of each task of a column."""
-        return {task: fmean(seeds.values()) for task, seeds in self.scores[name].items()}
+        return seed_means(self.scores[name])
+
+
+def seed_means(tasks: Mapping[str, Mapping[int, float]]) -> dict[str, float]:
+    """Return the mean over seeds of each task."""
+    return {task: fmean(seeds.values()) for task, seeds in tasks.items()}
 
 
 def usual_lines(lines: Sequence[Line]) -> list[Line]:
@@ -88,14 +100,17 @@ def usual_lines(lines: Sequence[Line]) -> list[Line]:
 def evidence(lines: Sequence[Line]) -> list[Evidence]:
     """Return the evidence of each suite with runs of an unchanged preset."""
     budgets = usual_budgets(lines)
-    suites: dict[str, dict[str, dict[str, dict[int, float]]]] = {}
+    shown: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
     for line in sorted(usual_lines(lines), key=_by_column):
         name = column(line, *budgets[line.suite])
-        columns = suites.setdefault(line.suite, {})
-        columns.setdefault(name, {}).setdefault(line.task, {})[line.seed] = line.score
+        scores, reached = shown.setdefault(line.suite, ({}, {}))
+        scores.setdefault(name, {}).setdefault(line.task, {})[line.seed] = line.score
+        if line.success_any is not None:
+            share = 100 * line.success_any
+            reached.setdefault(name, {}).setdefault(line.task, {})[line.seed] = share
     return [
-        Evidence(suite, budgets[suite][1], budgets[suite][0], columns, paper_scores(suite))
-        for suite, columns in suites.items()
+        Evidence(suite, budgets[suite][1], budgets[suite][0], scores, paper_scores(suite), reached)
+        for suite, (scores, reached) in shown.items()
     ]
 
 
@@ -153,6 +168,11 @@ def explanation(one: Evidence) -> str:
         text += f" In the paper's columns, only tasks with a score of `{one.ours}` count."
     if one.with_gap:
         text += f' The row "mean, with a gap" averages over the tasks {GAP}.'
+    if one.reached:
+        text += (
+            " A score counts the episodes with success at the last step; the last row counts those "
+            "with success at any step, where it was recorded."
+        )
     return f"{text} Only means over the same tasks can be compared.\n"
 
 
@@ -165,12 +185,15 @@ def table(one: Evidence) -> str:
         if theirs:
             shared = {task: theirs[task] for task in compared if task in theirs}
             cells = [number(theirs.get(task)) for task in one.tasks]
-            columns[title] = [*cells, *mean_cells(one, shared)]
+            columns[title] = [*cells, *mean_cells(one, shared), *(["-"] if one.reached else [])]
     for name, tasks in one.scores.items():
         cells = [seeds_cell(tasks.get(task, {})) for task in one.tasks]
         columns[name] = [*cells, *mean_cells(one, one.means(name))]
+        if one.reached:
+            columns[name].append(mean_cell([*seed_means(one.reached.get(name, {})).values()]))
     names = [*(task.removeprefix(f"{one.suite}-") for task in one.tasks), "**mean**"]
     names += ["**mean, with a gap**"] if one.with_gap else []
+    names += ["**mean, success at any step**"] if one.reached else []
     return markdown_table(["task", *columns], zip(names, *columns.values(), strict=True))
 
 

@@ -52,6 +52,7 @@ def _lines(result: Result) -> Iterator[Line]:
             cpu_hours=_hours(result.cpu_seconds) if trained else None,
             model_hash=(result.pretrained or "") if trained else "",
             policy=policy,
+            success_any=score.success_rate_any if result.metric == "success" else None,
         )
 
 

@@ -6,6 +6,7 @@ library are the present ones for both.
 
 import shlex
 import subprocess
+from collections import defaultdict
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -15,9 +16,11 @@ import pytest
 from wpt_agents.zoo.plan import presets
 from wpt_agents.zoo.plan.methods import METHODS, defaults
 from wpt_agents.zoo.record_lines import read
+from wpt_agents.zoo.report import record_curves
 
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "zoo" / "results"
+NAMES = ["baselines", "mid", "small-benchmark", "tried"]
 ELSEWHERE = "commit"  # a word of labels that separates runs of two commits; no setting
 
 
@@ -54,7 +57,7 @@ def settings_at(commit, suite, preset, changes, method, folder):
         return settings(suite, preset, changes, method)
 
 
-@pytest.mark.parametrize("name", ["baselines", "mid", "small-benchmark", "tried"])
+@pytest.mark.parametrize("name", NAMES)
 def test_labels_say_what_ran_at_the_commits_of_their_lines(name, tmp_path):
     lines = [line for line in read(RESULTS / f"{name}.csv") if line.frames]
     assert lines
@@ -69,3 +72,18 @@ def test_labels_say_what_ran_at_the_commits_of_their_lines(name, tmp_path):
         then = settings_at(first, suite, preset, ran, method, tmp_path)
         now = settings_now(suite, label.preset, said, method)
         assert then == now, (line.task, line.method, line.seed, str(label), line.commit)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_all_policies_of_a_run_have_the_same_label(name):
+    labels = defaultdict(set)
+    for line in read(RESULTS / f"{name}.csv"):
+        if line.frames:
+            labels[line.command, line.commit].add(str(line.preset))
+    assert [found for found in labels.values() if len(found) > 1] == []
+
+
+def test_the_learning_curves_have_the_labels_of_their_runs():
+    record = RESULTS / "mid.csv"
+    curves = {point.run for point in record_curves.read(record)}
+    assert curves and curves <= {line.run for line in read(record)}

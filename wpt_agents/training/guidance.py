@@ -27,7 +27,8 @@ def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance")
     """Read a schedule: 'linear(1,0,50000)', or a constant.
 
     :param most: the largest value allowed: 1 for a probability, infinite for a weight
-    :param name: the keyword that the schedule is of
+    :param text: the schedule
+    :param name: the name of the keyword, for the message
     :raises ValueError: anything else
     """
     number = r"([-+0-9.eE_]+)"
@@ -46,16 +47,17 @@ def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance")
 
 
 def ever(schedule: Schedule) -> bool:
-    """Return whether a schedule is ever above 0. Schedules are monotonic: both ends are enough."""
+    """Return whether a schedule is ever above 0; as it is monotonic, both ends are enough."""
     return schedule(0) > 0 or schedule(sys.maxsize) > 0
 
 
 def draw_window(probability: float, length: int, rng: np.random.Generator) -> tuple[int, int]:
     """Draw the steps k .. k + H - 1 of an episode at which the prior actor acts.
 
-    :param probability: of guiding this episode at all
-    :param length: steps of an episode
-    :return: (k, k + H), half-open; (0, 0) if the episode is not guided
+    :param probability: the probability that the episode is guided
+    :param length: number of steps of an episode
+    :return: (k, k + H), of which the first is included and the second is not; (0, 0) if the episode
+        is not guided
     """
     if rng.random() >= probability:
         return 0, 0

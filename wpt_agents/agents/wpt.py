@@ -403,7 +403,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :raises ValueError: `keep_data` without a dataset
         """
         if keep_data and self.dataset is None:
-            raise ValueError("keep_data=True keeps episodes beside a dataset: pass dataset= first")
+            raise ValueError(
+                "keep_data=True keeps episodes beside a dataset, and the agent has none: call "
+                "set_dataset(dataset) first"
+            )
         if keep_data:
             self.kept = self.kept or ReplayBuffer()
             for trajectory in self.replay_buffer.trajectories:

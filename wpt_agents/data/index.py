@@ -116,7 +116,7 @@ def read_meta(path: Path) -> Meta:
     if meta["version"] > VERSION:
         raise ValueError(
             f"{path} is a dataset of version {meta['version']}, this program reads up to "
-            f"{VERSION}; upgrade wpt-agents"
+            f"{VERSION}; update wpt_agents"
         )
     return Meta(meta["image_size"], meta["codec"])
 

@@ -101,7 +101,9 @@ class FramePolicy(PixelPolicy):
         frames = stack_frames(image, None if state is None else state[0], episode_start)
         action = self.decide(torch.from_numpy(frames).to(self.device), deterministic, generator)
         if not action.isfinite().all():
-            raise ValueError("The actor's output is not finite: the weights are damaged")
+            raise ValueError(
+                "The actor's output is not finite: the weights are damaged, load an earlier model"
+            )
         return action.cpu().numpy(), (frames,)
 
     def executed(self, state: State, action: np.ndarray) -> State:

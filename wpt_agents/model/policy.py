@@ -217,7 +217,9 @@ class WPTPolicy(PixelPolicy):
             decision = actor_or_prior(self, post, decision, self._tensor(frames[0]))
         action = decision.cpu().numpy()
         if not np.isfinite(action).all():
-            raise ValueError("The actor's output is not finite: the weights are damaged")
+            raise ValueError(
+                "The actor's output is not finite: the weights are damaged, load an earlier model"
+            )
         latent = [x.cpu().numpy() for x in post]
         return action, (*latent, *frames, action)
 

@@ -37,15 +37,24 @@ def check_images(dataset: TrajectoryDataset) -> None:
         )
 
 
-def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
-    """Refuse a dataset that WPT cannot learn from."""
+def check_dataset(
+    dataset: TrajectoryDataset, max_action_dim: int, batch_length: int, trained: bool = False
+) -> None:
+    """Raise a ValueError for a dataset that WPT cannot learn from.
+
+    :param trained: whether the model is trained, so that `max_action_dim` cannot change
+    """
     check_images(dataset)
     widest = max(dataset.action_dims)
     longest = max(dataset.lengths) + 1
     if widest > max_action_dim:
+        remedy = f"pass max_action_dim={widest}"
+        if trained:
+            narrow = f"dataset.subset(dataset.action_dims <= {max_action_dim})"
+            remedy = f"use {narrow}, or train a new one with max_action_dim={widest}"
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model at most "
-            f"max_action_dim={max_action_dim}: pass max_action_dim={widest}"
+            f"max_action_dim={max_action_dim}: {remedy}"
         )
     if longest < batch_length:
         raise ValueError(
@@ -59,7 +68,10 @@ def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) 
     if context < 1:
         raise ValueError(f"context, the number of images seen, must be at least 1, got {context}")
     if trajectory.image.shape[1:] != IMAGE_SHAPE:
-        raise ValueError(f"The trajectory's images are {trajectory.image.shape[1:]}: resize to 64")
+        raise ValueError(
+            f"The trajectory's images are {trajectory.image.shape[1:]}, the model takes "
+            f"{IMAGE_SHAPE}: resize them by wpt_agents.data.images.resized(image, {IMAGE_SIZE})"
+        )
     if trajectory.action_dim > max_action_dim:
         raise ValueError(
             f"The trajectory has {trajectory.action_dim} actions, the model takes at most "

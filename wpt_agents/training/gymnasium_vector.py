@@ -121,7 +121,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def _all_of(self, indices: VecEnvIndices, name: str) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise ValueError(f"{name} of a Gymnasium vector reaches all environments: no indices=")
+            raise ValueError(
+                f"{name} of a Gymnasium vector applies to all environments: leave indices out"
+            )
 
 
 def _autoreset_mode(vector: VectorEnv) -> AutoresetMode:

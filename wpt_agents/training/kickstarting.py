@@ -71,7 +71,7 @@ def parse_kickstart(text: str | float) -> Schedule | Adaptive:
     except ValueError as error:
         wrong = str(error)
     raise ValueError(
-        f"{wrong}. 'adaptive(start,end)', which goes by the returns, needs start >= end >= 0, for "
+        f"{wrong}. 'adaptive(start,end)', which depends on returns, needs start >= end >= 0, for "
         "example 'adaptive(20,1)'"
     )
 

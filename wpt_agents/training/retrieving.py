@@ -93,8 +93,8 @@ def read_retrieved(
     stored = len(dataset)
     if max(numbers, default=0) >= stored + len(kept):
         raise ValueError(
-            f"Episodes of earlier tasks were retrieved, and {len(kept)} are there: add them to "
-            "model.kept, or call reset_task()"
+            f"Episodes of earlier tasks were retrieved, but model.kept holds {len(kept)}: set it "
+            "to a ReplayBuffer with all of them, or call reset_task()"
         )
     chosen = dataset.subset([number for number in numbers if number < stored])
     yield from in_units_of(chosen, box)

@@ -47,7 +47,7 @@ def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance")
 
 
 def ever(schedule: Schedule) -> bool:
-    """Return whether a schedule is ever above 0; as it is monotonic, both ends are enough."""
+    """Return whether a schedule is ever above 0. Schedules are monotonic: both ends are enough."""
     return schedule(0) > 0 or schedule(sys.maxsize) > 0
 
 

@@ -42,7 +42,7 @@ class FrameKeywords(Keywords):
     batch_size: int = count(256, "transitions in a batch")
     gamma: float = share(0.99, "discount of one step")
     update_every: int = count(1, "collected steps per update")
-    pad: int = count(4, "pixels by which images are shifted at most", least=0)
+    pad: int = count(4, "largest random shift of the images, in pixels", least=0)
     task: str | None = keyword(
         None,
         must("a name", lambda value: isinstance(value, str)),
@@ -228,10 +228,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     ) -> Transitions:
         """Draw the batch of the next update from some episodes, with randomly shifted images.
 
-        :param stream: another number for each batch of the same update
         :param replay: the episodes
         :param size: N, the number of transitions
         :param n_steps: n, the number of rewards in a target
+        :param stream: another number for each batch of the same update
         :param tails: see `draw_transitions`
         """
         rng = self.batch_rng(stream)

@@ -51,7 +51,7 @@ class JSRLKeywords(DrQv2Keywords):
         1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
     )
     bc_shift: int = count(
-        3, "largest random shift of the clone's images in training", Stage.CLONING, least=0
+        3, "largest random shift of the clone's images, in pixels", Stage.CLONING, least=0
     )
     bc_variance: str = choice(
         "fixed",

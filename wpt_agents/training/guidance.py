@@ -26,8 +26,8 @@ def linear(start: float, end: float, duration: float) -> Schedule:
 def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance") -> Schedule:
     """Read a schedule: 'linear(1,0,50000)', or a constant.
 
-    :param most: the largest value allowed: 1 for a probability, infinite for a weight
     :param text: the schedule
+    :param most: the largest value allowed: 1 for a probability, infinite for a weight
     :param name: the name of the keyword, for the message
     :raises ValueError: anything else
     """

@@ -199,7 +199,7 @@ class Hyperparameters(Keywords):
         "weight, or a schedule of it, of a loss with which the actor imitates the prior actor on "
         "replayed images; not in the paper. 0: off; if the prior actor is good, try 20. "
         "'adaptive(20,1)' falls from 20 to 1 while the newest episodes return as much as "
-        "those of the warm-up, which the prior actor drove, and rises again while they do not",
+        "those of the warm-up, in which the prior actor acts, and rises again while they do not",
     )
     actor_delay: int = count(
         0,

@@ -155,9 +155,9 @@ def test_a_dataset_of_more_actions_is_refused():
 def test_a_trained_model_names_the_trajectories_that_it_can_take():
     model = pretrained([recorded()], max_action_dim=3)
     dataset = TrajectoryDataset.of([recorded(), recorded(actions=4)])
-    with pytest.raises(ValueError, match="train a new one with max_action_dim=4") as error:
+    with pytest.raises(ValueError, match="max_action_dim=4 to a new model") as error:
         model.set_dataset(dataset)
-    remedy = str(error.value).split("use ")[1].split(", or")[0]
+    remedy = str(error.value).split("alone, ")[1]
     model.set_dataset(eval(remedy, {"dataset": dataset}))
     assert model.dataset.lengths.size == 1
 

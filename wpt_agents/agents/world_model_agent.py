@@ -214,8 +214,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     def check_data(self, dataset: TrajectoryDataset) -> None:
         """Raise a ValueError for a dataset that WPT cannot learn from."""
         settings = self.hyperparameters
-        trained = self.progress.initialised
-        check_dataset(dataset, settings.max_action_dim, settings.batch_length, trained)
+        check_dataset(dataset, settings.max_action_dim, settings.batch_length)
 
     def check_env(self, env: VecEnv) -> None:
         """Raise a ValueError for an environment that WPT cannot act in."""

@@ -37,24 +37,16 @@ def check_images(dataset: TrajectoryDataset) -> None:
         )
 
 
-def check_dataset(
-    dataset: TrajectoryDataset, max_action_dim: int, batch_length: int, trained: bool = False
-) -> None:
-    """Raise a ValueError for a dataset that WPT cannot learn from.
-
-    :param trained: whether the model is trained, so that `max_action_dim` cannot change
-    """
+def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
+    """Raise a ValueError for a dataset that WPT cannot learn from."""
     check_images(dataset)
     widest = max(dataset.action_dims)
     longest = max(dataset.lengths) + 1
     if widest > max_action_dim:
-        remedy = f"pass max_action_dim={widest}"
-        if trained:
-            narrow = f"dataset.subset(dataset.action_dims <= {max_action_dim})"
-            remedy = f"use {narrow}, or train a new one with max_action_dim={widest}"
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model at most "
-            f"max_action_dim={max_action_dim}: {remedy}"
+            f"max_action_dim={max_action_dim}: pass max_action_dim={widest} to a new model, or use "
+            f"the other trajectories alone, dataset.subset(dataset.action_dims <= {max_action_dim})"
         )
     if longest < batch_length:
         raise ValueError(

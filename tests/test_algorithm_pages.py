@@ -33,7 +33,7 @@ PARTS = [
     "How to replicate the results",
     "Parameters",
 ]
-RUN = re.compile(r"^python -m wpt_agents\.zoo (run .*)$", re.M)
+RUN = re.compile(r"^python -m wpt_agents\.zoo (run [^#\n]*)", re.M)  # without a comment
 RUNS = sorted(set(RUN.findall("\n".join([*PAGES.values(), ZOO]))))
 # The commands of the figures and tables of the paper, on the zoo's page.
 PAPERS = RUN.findall(ZOO.split("\n## Figures and tables of the paper\n")[1].split("\n## ")[0])

@@ -73,12 +73,12 @@ def _looked_at(
         raise ValueError(f"camera={camera!r} needs our renderer: add rendering='near', for example")
     if image_key is not None:
         if rendering is not None:
-            raise ValueError("image_key and rendering are two ways to see: pass only one of them")
+            raise ValueError("image_key and rendering both choose the image: pass only one of them")
         return _LookObserved(env, image_key, crop)
     if rendering is None:
         return _LookRendered(env, crop)
     if crop:
-        raise ValueError(f"rendering={rendering!r} draws squares already: leave crop out")
+        raise ValueError(f"rendering={rendering!r} draws square images: leave crop out")
     return _LookDrawn(env, rendering, camera)
 
 

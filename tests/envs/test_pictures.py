@@ -179,7 +179,7 @@ def test_pixels_squeezes_wide_pictures_or_cuts_the_middle_out(options):
 
 def test_our_renderer_draws_squares_and_takes_no_crop():
     env = gym.make("InvertedPendulum-v5")
-    with pytest.raises(ValueError, match="rendering='fast' draws squares already: leave crop out"):
+    with pytest.raises(ValueError, match="rendering='fast' draws square images: leave crop out"):
         wpt_envs.pixels(env, rendering="fast", crop=True)
 
 
@@ -190,7 +190,7 @@ def test_an_entry_that_is_not_there_or_no_picture_is_refused_by_name():
         wpt_envs.pixels(Cameras(), image_key="arm").reset()
     with pytest.raises(ValueError, match="image_key='top' chooses from Dict observations"):
         wpt_envs.pixels(gym.make("CartPole-v1", render_mode="rgb_array"), image_key="top")
-    with pytest.raises(ValueError, match="two ways to see"):
+    with pytest.raises(ValueError, match="both choose the image"):
         wpt_envs.pixels(Cameras(), image_key="top", rendering="near")
     with pytest.raises(ValueError, match="camera='top' needs our renderer"):
         wpt_envs.pixels(Cameras(), camera="top")

@@ -152,6 +152,16 @@ def test_a_dataset_of_more_actions_is_refused():
     refused([recorded(actions=4)], "4 actions, .*: pass max_action_dim=4", max_action_dim=3)
 
 
+def test_a_trained_model_names_the_trajectories_that_it_can_take():
+    model = pretrained([recorded()], max_action_dim=3)
+    dataset = TrajectoryDataset.of([recorded(), recorded(actions=4)])
+    with pytest.raises(ValueError, match="max_action_dim=4 to a new model") as error:
+        model.set_dataset(dataset)
+    remedy = str(error.value).split("alone, ")[1]
+    model.set_dataset(eval(remedy, {"dataset": dataset}))
+    assert model.dataset.lengths.size == 1
+
+
 def test_a_refused_dataset_leaves_the_run_folder_alone(tmp_path):
     refused([], "is an empty list", run_dir=tmp_path)
     assert list(tmp_path.iterdir()) == []

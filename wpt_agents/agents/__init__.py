@@ -1,1 +1,1 @@
-"""Algorithms, one per file: WPT (Algorithm 1 of the paper) and the explorers."""
+"""Algorithms, one per file: WPT (Algorithm 1 of the paper), explorers and baselines."""

@@ -58,7 +58,7 @@ def declare(
 
 
 def common_parameters(agent: type) -> str:
-    """Return the documentation of `env` and all else that every agent takes, from a base class."""
+    """Return the documentation of the parameters that every agent has, such as `env`."""
     documents = (inspect.cleandoc(base.__doc__ or "") for base in agent.__mro__[1:])
     matches = (re.search(r":param env:.*?:param device:[^\n]*", text, re.S) for text in documents)
     return next(match[0] for match in matches if match)

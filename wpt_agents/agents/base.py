@@ -11,12 +11,13 @@ A subclass provides its keywords, a policy, a learner and one update. For exampl
 * The policy is a BasePolicy of SB3 with the methods of `training.rollout.Acting`, and
   `set_action_space`, `to_env` and `predict`.
 * The learner is any object; the optimisers among its attributes are saved with the policy.
-* `update` appends tensors to `metrics`: lists by the names of the log, such as "train/critic_loss".
-* All random numbers are drawn from `self.streams` by a counter of `self.progress`, so that an agent
+* `update` appends a scalar tensor to each of the lists in `metrics`, whose keys are the names in
+  the log, such as "train/critic_loss".
+* Draw all random numbers from `self.streams`, with a counter of `self.progress`, so that an agent
   that was loaded continues exactly. `collect` does so already.
 
-Every keyword can be read as an attribute (`model.gamma`) and, as long as it takes effect, written.
-A subclass may also override the methods below `# Hooks`.
+Every keyword can be read as an attribute (`model.gamma`), and written as long as a change can still
+take effect. A subclass may also override the methods below `# Hooks`.
 """
 
 import os
@@ -60,24 +61,24 @@ class PixelAgent(SavedAgent):
 
     @abstractmethod
     def update(self, metrics: MetricLists) -> None:
-        """Make one update from `self.replay_buffer`; append to `metrics` by the log's names."""
+        """Make one update on `self.replay_buffer` and append its scalar tensors to `metrics`."""
 
     @property
     @abstractmethod
     def updates_per_step(self) -> float:
-        """How many updates are made for each collected step."""
+        """The number of updates for each collected step."""
 
     # Hooks
 
     def prepare(self, progress_bar: bool) -> None:
-        """Do what comes before collecting; called by `learn`, when the environment is reset."""
+        """Prepare collecting, as by cloning; `learn` calls it after resetting the environment."""
 
     def before_step(self) -> None:
-        """Do what must come before each step that is collected, such as setting the noise."""
+        """Prepare the next step, such as by setting the noise of exploration."""
 
     @property
     def warmup_driver(self) -> str:
-        """What chooses the actions in the warm-up, in words."""
+        """What chooses the actions in the warm-up, as words for messages."""
         return "random actions"
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
@@ -96,11 +97,11 @@ class PixelAgent(SavedAgent):
         """Handle a finished episode before it is added to the replay buffer."""
 
     def steps_to_update(self) -> float:
-        """Return how many collected steps pay for the next update."""
+        """Return the number of collected steps for each update."""
         return 1 / self.updates_per_step
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return an assignment with which `steps` steps are enough for an update, "" for none."""
+        """Return a line of code that makes `steps` steps enough for an update, or ""."""
         return ""
 
     # Learning
@@ -114,7 +115,7 @@ class PixelAgent(SavedAgent):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Collect and update in turns.
+        """Collect episodes and make updates in turns.
 
         :param total_timesteps: calls of `env.step`, summed over the environments, as in SB3. 0
             makes no step and no update, but the preparations for them, such as reading offline
@@ -221,10 +222,14 @@ class PixelAgent(SavedAgent):
         return go_on
 
     def first_images(self, number: int) -> np.ndarray:
-        """Return the first images of episodes, (number, 64, 64, 3).
+        """Return the first images of episodes of the task.
 
-        One is that of the first environment's open episode. For more, all environments are reset
-        as often as it takes; in the middle of episodes, which a reset would cut, there is only one.
+        A single image is that of the first environment's open episode. For more, all environments
+        are reset as often as necessary. In the middle of episodes, which a reset would interrupt,
+        only one image is returned.
+
+        :param number: the number of images
+        :return: (number, 64, 64, 3) uint8, or (1, 64, 64, 3) in the middle of episodes
         """
         image: np.ndarray = np.array(to_images(self._last_obs)[0])  # copies: VecEnvs may reuse it
         if self.rollout is not None and not self._last_episode_starts.all():
@@ -269,7 +274,7 @@ class PixelAgent(SavedAgent):
         return self.guidance_window(self.streams.numpy(Purpose.WINDOW, self.progress.windows_drawn))
 
     def _store(self, finished: list[Trajectory], cut: int) -> None:
-        """Store completed trajectories, of which `cut` are of episodes that go on."""
+        """Store completed trajectories, of which `cut` belong to episodes that have not ended."""
         for trajectory in finished:
             self.on_episode(trajectory)
             self.replay_buffer.add(trajectory)

@@ -126,7 +126,7 @@ class ConfiguredAgent(BaseAlgorithm):
             self._use_env(wrapped)
 
     def __repr__(self) -> str:
-        """The keywords that differ from their defaults, those that the size decides, and counts."""
+        """The keywords that differ from their defaults or depend on the size, and the counters."""
         chosen = ", ".join(f"{k}={v!r}" for k, v in self.hyperparameters.chosen().items())
         counted = f"num_timesteps={self.num_timesteps}, updates={self.updates}"
         return f"<{type(self).__name__}({chosen}), {counted}>"
@@ -143,7 +143,7 @@ class ConfiguredAgent(BaseAlgorithm):
 
     @abstractmethod
     def make_learner(self) -> Any:
-        """Make what updates `self.policy`, with new optimisers."""
+        """Make the object that updates `self.policy`, with new optimisers."""
 
     def unbound_action_space(self) -> spaces.Box:
         """Return the action space of an agent that was made without an environment."""
@@ -159,14 +159,14 @@ class ConfiguredAgent(BaseAlgorithm):
         self.learner = self.make_learner()
 
     def on_other_actions(self) -> None:
-        """Adapt to an environment whose actions have another width than those before."""
+        """Adapt to an environment whose actions have another number of dimensions."""
         self.reset_task()
 
     # Keywords
 
     @classmethod
     def check_keywords(cls, kwargs: Mapping[str, Any]) -> None:
-        """Refuse keywords that the constructor does not have, with the nearest ones."""
+        """Raise a ValueError for an unknown keyword, which suggests similar ones."""
         valid = set(inspect.signature(cls).parameters) - {"_init_setup_model"}
         for name in kwargs:
             if name not in valid:
@@ -208,10 +208,10 @@ class ConfiguredAgent(BaseAlgorithm):
         return None
 
     def hyperparameters_changed(self) -> None:
-        """Bring what was made from `self.hyperparameters` up to date; ValueError refuses them."""
+        """Update what depends on `self.hyperparameters`, or raise a ValueError to reject them."""
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed everything that is drawn from now on, and the environment's next reset."""
+        """Seed all random numbers from now on, and the environment's next reset."""
         if seed is not None:
             self.hyperparameters = self.hyperparameters.changed(seed=seed)
             self.streams = Streams(seed)
@@ -222,8 +222,8 @@ class ConfiguredAgent(BaseAlgorithm):
     def set_dataset(self, dataset: Data | None) -> None:
         """Use another dataset from the next call of `learn` on.
 
-        Trajectories are then chosen, and the prior actor is trained, again. Until then the agent
-        goes on with those of the dataset before.
+        That call chooses trajectories and trains the prior actor again. Until then, the agent uses
+        the trajectories and the prior actor of the previous dataset.
 
         :param dataset: any kind that the keyword `dataset` takes; None changes nothing
         :raises ValueError: something that is no dataset, or data that the agent cannot learn from
@@ -235,13 +235,13 @@ class ConfiguredAgent(BaseAlgorithm):
             self.check_units()
 
     def check_data(self, dataset: TrajectoryDataset) -> None:
-        """Refuse a dataset that the agent cannot learn from."""
+        """Raise a ValueError for a dataset that the agent cannot learn from."""
 
     def check_units(self) -> None:
         """Warn if the environment's actions are in other units than those of the dataset."""
 
     def check_env(self, env: VecEnv) -> None:
-        """Refuse an environment that the agent cannot act in."""
+        """Raise a ValueError for an environment that the agent cannot act in."""
         check_spaces(env)
 
     @staticmethod
@@ -256,7 +256,8 @@ class ConfiguredAgent(BaseAlgorithm):
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Use another environment, with any number of copies.
 
-        If its actions have another width, what was learnt and collected for a task is discarded.
+        If its actions have another number of dimensions, everything that was learnt and collected
+        for a task is discarded.
 
         :param env: an id, a Gymnasium environment, a vector environment, or a list of environments
         :param force_reset: reset the environment at the next call of `learn`; another number of

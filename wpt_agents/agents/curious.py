@@ -5,8 +5,8 @@ Example::
     explorer = Plan2Explore("WPTPolicy", env, seed=0, **EXPLORE)
     trajectories = list(explorer.explore(40))
 
-Both are WPT from scratch with the task's reward replaced by surprise: the actor learns to seek it
-in the imagination of its own world model.
+Both are WPT from scratch with the task's reward replaced by a measure of surprise. The actor learns
+in imagination, in its own world model, to act where the surprise is large.
 """
 
 import sys
@@ -62,13 +62,13 @@ class CuriousLearner(Learner):
         self.curiosity_optimizer = self.adam(parts, self.model_rate)
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
-        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        """Use other hyperparameters from now on; the states of the optimisers are kept."""
         super().configure(hyperparameters)
         self.set_rate(self.curiosity_optimizer, self.model_rate)
 
 
 class ICMLearner(CuriousLearner):
-    """The reward head learns the forward model's error on real transitions."""
+    """A learner whose reward is the forward model's error on real transitions."""
 
     def update_world_model(
         self,
@@ -99,7 +99,7 @@ class ICMLearner(CuriousLearner):
 
 
 class Plan2ExploreLearner(CuriousLearner):
-    """The reward of a step is how much an ensemble disagrees on where it leads.
+    """A learner whose reward is the disagreement of an ensemble on where a step leads.
 
     Rewards belong to the state that a step leads to, as the world model's do: in imagination to the
     states 1 .. H-1, and at the replayed state 0 to the real step that led there, so that the
@@ -164,11 +164,14 @@ class Explorer(WPT):
         return self.learner_class(self.policy, self.hyperparameters)
 
     def explore(self, episodes: int) -> Iterator[Trajectory]:
-        """Collect until there are `episodes`, learning after each; yield each with its rewards.
+        """Collect up to `episodes` episodes in all, learn after each, and yield each.
 
-        An episode is a function of the seed and of the replay buffer, so that an explorer that was
-        loaded and whose episodes were added continues as if it had never stopped. One that reaches
-        `max_trajectory_length` steps ends there.
+        An episode depends on the seed and the replay buffer alone. So an explorer continues as if
+        it had never stopped after it was loaded and its episodes were added to the replay buffer.
+        Episodes end after `max_trajectory_length` steps at the latest.
+
+        :param episodes: the number of episodes in all, including those in the replay buffer
+        :return: the episodes with the environment's rewards
         """
         assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
         _, callback = self._setup_learn(

@@ -30,7 +30,7 @@ EDGE = 1 - 1e-6  # actions are clamped to this, as in the published code
 
 
 class Actor(nn.Module):
-    """μ(h): a trunk of its own, then an MLP and tanh.
+    """The deterministic policy μ(h): a trunk, then an MLP and tanh.
 
     :param embed_dim: E, the width of h = f(o)
     :param features: width of the trunk's latent
@@ -44,17 +44,17 @@ class Actor(nn.Module):
         self.layers = mlp(features, hidden, action_dim)
 
     def before_tanh(self, embed: Tensor) -> Tensor:
-        """(N, E) -> (N, A), u of the mean action tanh(u)."""
+        """Return u of the mean action tanh(u): (N, E) -> (N, A)."""
         u: Tensor = self.layers(self.trunk(embed))
         return u
 
     def forward(self, embed: Tensor) -> Tensor:
-        """(N, E) -> (N, A), the mean action in (-1, 1)."""
+        """Return the mean action in (-1, 1): (N, E) -> (N, A)."""
         return self.before_tanh(embed).tanh()
 
 
 class Critic(nn.Module):
-    """Q_1 and Q_2 on a common trunk.
+    """The value functions Q_1(h, a) and Q_2(h, a) on a common trunk.
 
     :param embed_dim: E, the width of h = f(o)
     :param features: width of the trunk's latent
@@ -69,7 +69,7 @@ class Critic(nn.Module):
         self.q2 = mlp(features + action_dim, hidden, 1)
 
     def forward(self, embed: Tensor, action: Tensor) -> Tensor:
-        """(N, E), (N, A) -> (2, N)."""
+        """Return both values: (N, E), (N, A) -> (2, N)."""
         inputs = torch.cat([self.trunk(embed), action], -1)
         return torch.stack([self.q1(inputs), self.q2(inputs)]).squeeze(-1)
 
@@ -77,9 +77,10 @@ class Critic(nn.Module):
 def noisy_action(
     mean: Tensor, std: float, clip: float | None = None, generator: Generator | None = None
 ) -> Tensor:
-    """Action a = clamp(μ + clip(ε, -c, c)), ε ~ N(0, σ²); with the gradient of μ + clip(ε).
+    """Add noise to an action: a = clamp(μ + clip(ε, -c, c)), ε ~ N(0, σ²).
 
-    The noise is clipped in Eq. (1) and (4) only: acting explores with all of it.
+    The gradient is that of μ + clip(ε). The noise is clipped in Eq. (1) and (4) only, not in
+    acting.
 
     :param mean: (N, A), μ
     :param std: σ of the exploration schedule
@@ -95,9 +96,10 @@ def noisy_action(
 def td_target(reward: Tensor, discount: Tensor, next_q: Tensor) -> Tensor:
     """Eq. (2): y = Σ_{i<n} γ^i r_{t+i} + γ^n min_k Qbar_k(h_{t+n}, a_{t+n}).
 
-    :param reward: (N,), the sum, as `draw_transitions` makes it
-    :param discount: (N,), γ^n, or 0 behind a terminal state
-    :param next_q: (2, N), of the target critic
+    :param reward: (N,), the discounted sum, as `draw_transitions` computes it
+    :param discount: (N,), γ^n, or 0 after a terminal state
+    :param next_q: (2, N), the values of the target critic
+    :return: (N,), y
     """
     assert reward.shape == discount.shape == next_q.shape[1:], (reward.shape, next_q.shape)
     return reward + discount * next_q.amin(0)
@@ -106,15 +108,16 @@ def td_target(reward: Tensor, discount: Tensor, next_q: Tensor) -> Tensor:
 def critic_loss(q: Tensor, target: Tensor) -> Tensor:
     """Eq. (1): E[(Q_1 - y)²] + E[(Q_2 - y)²].
 
-    :param q: (2, N)
+    :param q: (2, N), the values of the critic
     :param target: (N,), y; no gradient reaches it
+    :return: scalar
     """
     assert q.shape[1:] == target.shape, (q.shape, target.shape)
     return (q - target.detach()).square().mean(1).sum()
 
 
 def actor_loss(q: Tensor) -> Tensor:
-    """Eq. (4): -E[min_k Q_k(h, a)], a of the actor: (2, N) -> scalar."""
+    """Eq. (4): -E[min_k Q_k(h, a)], with a from the actor: (2, N) -> scalar."""
     return -q.amin(0).mean()
 
 
@@ -155,12 +158,12 @@ class DrQv2Keywords(FrameKeywords):
 class DrQv2Policy(FramePolicy):
     """Encoder, actor, critic and target critic; the target critic has no encoder of its own.
 
-    It is made by `channels`, `feature_dim`, `hidden_dim` and `frame_differences` of
+    Its widths are the keywords `channels`, `feature_dim`, `hidden_dim` and `frame_differences` of
     `DrQv2Keywords`.
     """
 
     def build(self) -> None:
-        """Draw the networks for actions of width `action_dim`."""
+        """Initialise the networks for actions of width `action_dim`."""
         widths = self.widths
         self.encoder = self.make_encoder(widths.channels)
         shape = self.encoder.embed_dim, widths.feature_dim, widths.hidden_dim, self.action_dim
@@ -171,7 +174,7 @@ class DrQv2Policy(FramePolicy):
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
 
     def make_encoder(self, channels: int) -> Any:
-        """Draw an encoder: a module from frames to (N, `embed_dim`)."""
+        """Initialise an encoder: (N, F, 64, 64, 3) uint8 -> (N, `embed_dim`)."""
         differences = vars(self.widths).get("frame_differences", 0.0)  # not in older files
         encoder = FrameEncoder((channels,) * 4, (2, 1, 1, 1), centre=0.5, differences=differences)
         return encoder.apply(orthogonal)
@@ -179,15 +182,15 @@ class DrQv2Policy(FramePolicy):
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
     ) -> Tensor:
-        """(N, F, 64, 64, 3) uint8 -> (N, A): the mean, or the mean and noise of deviation `std`."""
+        """Return the mean action, or with noise: (N, F, 64, 64, 3) uint8 -> (N, A)."""
         mean = self.actor(self.encoder(frames))
         return mean if deterministic else noisy_action(mean, self.std, None, generator)
 
 
 class DrQv2Learner:
-    """One update of critic, encoder and actor.
+    """The optimisers of encoder, critic and actor, and their updates.
 
-    :param policy: whose networks learn
+    :param policy: the networks to train
     :param settings: learning rate, τ and the noise's clip c
     """
 
@@ -202,9 +205,9 @@ class DrQv2Learner:
     def update(
         self, batch: Transitions, std: float, generator: Generator | None = None
     ) -> Mapping[str, Tensor]:
-        """Critic and encoder by Eq. (1), actor by Eq. (4), then the target critic.
+        """Update critic and encoder by Eq. (1), the actor by Eq. (4), then the target critic.
 
-        :param batch: with shifted images
+        :param batch: transitions, whose images are shifted already
         :param std: σ of the exploration schedule
         """
         policy, clip = self.policy, self.settings.std_clip
@@ -269,7 +272,7 @@ class DrQv2(FrameAgent, keywords=DrQv2Keywords):
 
     @property
     def std_now(self) -> float:
-        """σ of the exploration schedule at the present step."""
+        """The standard deviation σ of the exploration schedule at the current step."""
         return parse_schedule(self.hyperparameters.std, np.inf, "std")(self.num_timesteps)
 
     def update(self, metrics: MetricLists) -> None:

@@ -1,4 +1,4 @@
-"""What DrQ-v2, RLPD and MR.Q share as agents: stacked frames, n-step batches and offline data."""
+"""The common base of DrQ-v2, RLPD and MR.Q: stacked frames, n-step batches and offline data."""
 
 import warnings
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class FrameKeywords(Keywords):
     batch_size: int = count(256, "transitions in a batch")
     gamma: float = share(0.99, "discount of one step")
     update_every: int = count(1, "collected steps per update")
-    pad: int = count(4, "pixels by which images are shifted at most", least=0)
+    pad: int = count(4, "largest random shift of the images, in pixels", least=0)
     task: str | None = keyword(
         None,
         must("a name", lambda value: isinstance(value, str)),
@@ -64,10 +64,10 @@ class FrameKeywords(Keywords):
 
 @dataclass(kw_only=True)
 class FrameProgress(Progress):
-    """How far an agent has come, and which offline data it uses.
+    """Counters of a `FrameAgent`, and the offline data that it uses.
 
     :ivar retrieved_ids: numbers of the offline trajectories
-    :ivar retrieved_of: the fingerprint of the dataset that they number
+    :ivar retrieved_of: the fingerprint of the dataset that these numbers refer to
     :ivar cloned: whether the prior actor has been trained
     """
 
@@ -103,12 +103,12 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     @property
     def updates_per_step(self) -> float:
-        """How many updates are made for each collected step."""
+        """The number of updates for each collected step."""
         return 1 / self.hyperparameters.update_every
 
     @property
     def std_now(self) -> float:
-        """σ of the noise that is added to actions at the present step, 0 if there is none."""
+        """The standard deviation σ of the noise on actions at the current step, 0 for none."""
         return 0.0
 
     def before_step(self) -> None:
@@ -116,7 +116,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         self.policy.std = self.std_now
 
     def restore(self, *args: Any) -> None:
-        """Take over a model file, and the noise of the step that it was written at."""
+        """Restore a model file, and set the noise of the step at which it was written."""
         super().restore(*args)
         self.policy.std = self.std_now
 
@@ -131,11 +131,11 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return False
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return an assignment with which `steps` collected steps are enough for an update."""
+        """Return a line of code that makes `steps` collected steps enough for an update."""
         return f"model.update_every = {max(steps, 1)}"
 
     def check_data(self, dataset: TrajectoryDataset) -> None:
-        """Refuse a dataset of no images, or of images of another size than the encoder's."""
+        """Raise a ValueError for an empty dataset, or for images that are not 64 x 64."""
         check_images(dataset)
 
     def check_units(self) -> None:
@@ -146,7 +146,10 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
     def set_dataset(self, dataset: Data | None) -> None:
         """Use another dataset; the next call of `learn` chooses the offline data from it.
 
-        Until then the agent goes on with those of the dataset before.
+        Until then, the agent uses those of the previous dataset.
+
+        :param dataset: any kind that the keyword `dataset` takes; None changes nothing
+        :raises ValueError: something that is no dataset, or data that the agent cannot learn from
         """
         if dataset is not None and not self.uses_data:
             warnings.warn(
@@ -187,14 +190,14 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
 
     @property
     def outdated(self) -> bool:
-        """Whether offline data of another dataset than the present one are chosen."""
+        """Whether the chosen offline data are of another dataset than the current one."""
         progress = self.progress
         other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
         return bool(progress.retrieved_ids) and other
 
     @property
     def chosen(self) -> bool:
-        """Whether offline data of the present dataset are chosen, read or not."""
+        """Whether offline data of the current dataset are chosen, read or not."""
         return bool(self.progress.retrieved_ids) and not self.outdated
 
     def _related(self) -> list[int]:
@@ -212,7 +215,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         )
 
     def seen(self, replay: ReplayBuffer) -> Sequence[np.ndarray] | None:
-        """Return what stands for the episodes' images in a batch; None for the images."""
+        """Return what a batch contains instead of the episodes' images, or None for the images."""
         return None
 
     def draw(
@@ -223,10 +226,13 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         stream: int = 0,
         tails: bool = False,
     ) -> Transitions:
-        """Draw the batch of the next update from some episodes; its images are shifted at random.
+        """Draw the batch of the next update from some episodes, with randomly shifted images.
 
+        :param replay: the episodes
+        :param size: N, the number of transitions
+        :param n_steps: n, the number of rewards in a target
         :param stream: another number for each batch of the same update
-        :param tails: of `draw_transitions`
+        :param tails: see `draw_transitions`
         """
         rng = self.batch_rng(stream)
         settings = self.hyperparameters
@@ -245,7 +251,7 @@ class FrameAgent(PixelAgent, keywords=FrameKeywords, progress=FrameProgress):
         return np.random.default_rng([self.streams.seed, int(Purpose.UPDATE), self.updates, stream])
 
     def hyperparameters_changed(self) -> None:
-        """Hand the keywords to learner and policy, and the learning rate to the optimisers."""
+        """Pass the keywords to learner and policy, and the learning rate to the optimisers."""
         self.learner.settings = self.hyperparameters
         self.policy.std = self.std_now
         for optimizer in optimizers(self.learner).values():

@@ -51,7 +51,7 @@ class JSRLKeywords(DrQv2Keywords):
         1e-4, "learning rate of the clone, which falls linearly to 0", Stage.CLONING
     )
     bc_shift: int = count(
-        3, "largest random shift of the clone's images in training", Stage.CLONING, least=0
+        3, "largest random shift of the clone's images, in pixels", Stage.CLONING, least=0
     )
     bc_variance: str = choice(
         "fixed",
@@ -75,8 +75,9 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
         model = JSRL("CnnPolicy", "wpt/metaworld-hammer-v0", dataset="data/metaworld")
         model.learn(75_000)
 
-    The clone learns from trajectories of the task, or else of the robot. It is the prior actor of
-    WPT. The agent learns from the steps of the clone as from its own, but not from offline data.
+    The clone, which is WPT's prior actor, is trained on trajectories of the task or, if there are
+    none, of the robot. The agent learns from the steps of the clone as from its own, but not from
+    offline data.
 
     :param policy: "CnnPolicy"
     """
@@ -93,7 +94,7 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
 
     @property
     def wants_data(self) -> bool:
-        """Whether offline data are used: until they are cloned, and again if they are others."""
+        """Whether offline data are needed: until the clone is trained, and again for other data."""
         return not self.progress.cloned or self.outdated
 
     def prepare(self, progress_bar: bool) -> None:
@@ -126,14 +127,14 @@ class JSRL(DrQv2, keywords=JSRLKeywords):
 
     @property
     def warmup_driver(self) -> str:
-        """What chooses the actions in the warm-up, in words."""
+        """What chooses the actions in the warm-up, as words for messages."""
         clones = self.progress.cloned or self.dataset is not None
         return "the clone's actions" if clones else super().warmup_driver
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
-        """Return the steps of a new episode that the clone drives: 0 .. h - 1."""
+        """Return the steps of a new episode at which the clone acts: 0 .. h - 1, as (0, h)."""
         return (0, int(rng.choice(HORIZONS))) if self.progress.cloned else (0, 0)
 
     def guide(self, frames: np.ndarray) -> np.ndarray:
-        """Act as the clone, or at random without one: (k, F, 64, 64, 3) -> (k, A)."""
+        """Return the clone's actions, or random ones without it: (k, F, 64, 64, 3) -> (k, A)."""
         return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)

@@ -1,6 +1,7 @@
 """MR.Q (Fujimoto et al., 2025): TD3 on features that predict reward, next features and end.
 
-Source: https://arxiv.org/abs/2501.16142. It came after the paper and is not among its baselines.
+Source: https://arxiv.org/abs/2501.16142. MR.Q appeared after the paper of WPT and is not among the
+paper's baselines.
 """
 
 from collections.abc import Mapping
@@ -68,10 +69,10 @@ class MRQKeywords(FrameKeywords):
 
 @dataclass(kw_only=True)
 class MRQProgress(FrameProgress):
-    """How far an agent has come.
+    """Counters of an `MRQ` agent.
 
     :ivar scale: mean absolute reward when the targets were last copied
-    :ivar target_scale: that of the copy before
+    :ivar target_scale: `scale` at the copy before
     :ivar updates_before: updates that were made for earlier tasks
     """
 
@@ -90,7 +91,7 @@ class MRQPolicy(FramePolicy):
     """
 
     def build(self) -> None:
-        """Draw the networks for actions of width `action_dim`."""
+        """Initialise the networks for actions of width `action_dim`."""
         width = self.widths.latent_dim
         hidden = self.widths.hidden_dim
         self.encoder = ModelEncoder(self.widths.channels, width, hidden, self.action_dim)
@@ -105,16 +106,16 @@ class MRQPolicy(FramePolicy):
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
     ) -> Tensor:
-        """(N, F, 64, 64, 3) uint8 -> (N, A): the mean, or the mean and noise of deviation `std`."""
+        """Return the mean action, or with noise: (N, F, 64, 64, 3) uint8 -> (N, A)."""
         mean: Tensor = self.actor(self.encoder.state(frames)).tanh()
         return mean if deterministic else noisy(mean, self.std, inf, generator)
 
 
 class MRQLearner:
-    """One update of encoder, of value functions and of actor, and the copy to the targets.
+    """The optimisers of encoder, value functions and actor, and their updates.
 
-    :param policy: whose networks learn
-    :param settings: rates and weights
+    :param policy: the networks to train
+    :param settings: learning rates and weights of the losses
     """
 
     def __init__(self, policy: MRQPolicy, settings: MRQKeywords) -> None:
@@ -137,7 +138,7 @@ class MRQLearner:
     def update_encoder(self, batch: Steps, ends: bool) -> Tensor:
         """Take a step on the encoder's loss; return the loss.
 
-        :param batch: with shifted images
+        :param batch: steps, whose images are shifted already
         :param ends: whether any episode ended in a terminal state
         """
         settings = self.settings
@@ -159,9 +160,9 @@ class MRQLearner:
     ) -> Mapping[str, Tensor]:
         """Take a step of the value functions and one of the actor, on fixed features.
 
-        :param batch: with shifted images
-        :param scale: of the values
-        :param target_scale: of the target value functions
+        :param batch: transitions, whose images are shifted already
+        :param scale: the unit of the values, the mean absolute reward
+        :param target_scale: the unit of the values of the target networks
         """
         policy = self.policy
         settings = self.settings
@@ -215,7 +216,7 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
 
     @property
     def std_now(self) -> float:
-        """σ of the noise on actions, which is the same at all steps."""
+        """The standard deviation σ of the noise on actions, the same at all steps."""
         return self.hyperparameters.std
 
     def update(self, metrics: MetricLists) -> None:
@@ -249,7 +250,7 @@ class MRQ(FrameAgent, keywords=MRQKeywords, progress=MRQProgress):
         return torch.stack(losses).mean()
 
     def hyperparameters_changed(self) -> None:
-        """Hand the keywords to learner and policy, and the rates to the optimisers."""
+        """Pass the keywords to learner and policy, and the learning rates to the optimisers."""
         super().hyperparameters_changed()
         settings = self.hyperparameters
         for group in self.learner.encoder_optimizer.param_groups:

@@ -27,7 +27,7 @@ FROM_FILE = ("size", "max_action_dim")
 
 
 class Undrawn(TorchFunctionMode):
-    """Leave new weights as they lie in memory; untouched, they take none of it."""
+    """Skip the initialisation of new weights, so that untouched weights occupy no memory."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call `func`, or only return its tensor if it would draw weights."""
@@ -49,8 +49,10 @@ def import_model(
     """Make an agent with the weights of the authors' file; see `WPT.from_official`.
 
     :param agent: `WPT` or a subclass
-    :param lean: make all networks without drawing their weights, to save memory and time; not for
-        an agent that has more networks than its policy's
+    :param path: the authors' file
+    :param stoch: the number of groups of z, or None for the authors' 32
+    :param lean: do not initialise the weights that are loaded next, to save memory and time; not
+        for an agent that has other networks than those of its policy
     """
     for name in FROM_FILE:
         if name in keywords:
@@ -74,7 +76,7 @@ def import_model(
 
 
 def check_shapes(policy: WPTPolicy, tensors: dict[str, Tensor], path: Path) -> None:
-    """Refuse a tensor of another shape than the policy's."""
+    """Raise a ValueError for a tensor of another shape than the policy's."""
     for name, weight in policy.state_dict().items():
         if name in tensors and tensors[name].shape != weight.shape:
             raise ValueError(

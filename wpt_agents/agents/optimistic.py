@@ -18,9 +18,10 @@ SHOWN = 0.8  # share of the online rows that each reward head learns from, so th
 def reward_ensemble_loss(prediction: Tensor, reward: Tensor, shown: Tensor) -> Tensor:
     """E[(r_k(z) - r)²] over the rows that are shown to member k.
 
-    :param prediction: (K, N)
+    :param prediction: (K, N), the rewards that the members predict
     :param reward: (N,), the environment's
-    :param shown: (K, N) bool
+    :param shown: (K, N) bool, the rows that each member learns from
+    :return: scalar
     """
     assert prediction.shape == shown.shape, (prediction.shape, shown.shape)
     return ((prediction - reward).square() * shown).sum() / shown.sum().clamp_min(1)
@@ -29,7 +30,7 @@ def reward_ensemble_loss(prediction: Tensor, reward: Tensor, shown: Tensor) -> T
 def optimistic_reward(prediction: Tensor, beta: float) -> tuple[Tensor, Tensor]:
     """ExPLORe's label by an ensemble: r = mean_k r_k(z) + β std_k r_k(z).
 
-    :param prediction: (K, N)
+    :param prediction: (K, N), the rewards that the members predict
     :param beta: β
     :return: the label and the bonus in it, β std, (N,) each
     """
@@ -46,11 +47,12 @@ def label(
     beta: float,
     generator: Generator | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Train the ensemble on the environment's rows, then label the offline rows by it.
+    """Train the ensemble on the environment's rows, then label the offline rows with it.
 
-    :param reward: (N,), of which the rows from `online` on are not read
+    :param reward: (N,), whose rows from `online` on are not read
     :param latent: (N, Z), of the images that the steps led to; the ensemble does not train it
-    :param online: how many rows, the first ones, are of the environment
+    :param online: the number of first rows that are of the environment
+    :param beta: β, the weight of the bonus
     :return: (N,) rewards, and metrics
     """
     prediction = ensemble(latent[:online])

@@ -34,8 +34,9 @@ def prune(weight: Tensor, owner: Tensor, task: int, tasks_left: int) -> Tensor:
 
     All tasks of a sequence get equally many weights of each layer, up to rounding.
 
-    :param weight: of one layer
-    :param owner: the task that owns each weight, or FREE
+    :param weight: the weights of one layer, of any shape
+    :param owner: the task that owns each weight, or FREE, in the shape of `weight`
+    :param task: the task that gets weights
     :param tasks_left: tasks that come after this one
     :return: the owners afterwards
     """
@@ -50,12 +51,12 @@ def prune(weight: Tensor, owner: Tensor, task: int, tasks_left: int) -> Tensor:
 class PackNetPolicy(DrQv2Policy):
     """DrQ-v2's networks with an owner for each weight of the encoder and the actor.
 
-    Layer norms and biases have no owners; they are frozen when the first task ends. The critic
-    serves the present task only.
+    Layer norms and biases have no owners; they are frozen when the first task ends. The critic is
+    that of the current task.
     """
 
     def build(self) -> None:
-        """Draw the networks; all weights are free."""
+        """Initialise the networks; all weights are free."""
         super().build()
         for name, weight in self.managed():
             self.register_buffer(_owner(name), torch.full(weight.shape, FREE, dtype=torch.int8))
@@ -87,7 +88,7 @@ class PackNetPolicy(DrQv2Policy):
 
     @torch.no_grad()
     def redraw(self) -> None:
-        """Draw the free weights and the critic again, for the next task."""
+        """Initialise the free weights and the critic again, for the next task."""
         fresh = dict(deepcopy(self).apply(orthogonal).managed())
         for name, weight in self.managed():
             free = self.owner(name) == FREE
@@ -115,7 +116,8 @@ def _owner(name: str) -> str:
 class PackNetLearner(DrQv2Learner):
     """The update of DrQ-v2 that changes no weight of another owner.
 
-    With moments from before, Adam would move a weight whose gradient is zero. A new one does not.
+    Make a new one for each task: with moments of an earlier task, Adam would change weights whose
+    gradient is zero.
 
     :param trains: the owner whose weights are trained: FREE, or a task that is being retrained
     """
@@ -149,9 +151,9 @@ class PackNetKeywords(DrQv2Keywords):
 
 @dataclass(kw_only=True)
 class PackNetProgress(FrameProgress):
-    """How far an agent has come in its sequence of tasks.
+    """Counters of a `PackNet` agent in its sequence of tasks.
 
-    :ivar task: the present task's number, from 0 on
+    :ivar task: the current task's number, from 0 on
     :ivar updates_before: updates that were made for earlier tasks
     """
 
@@ -185,7 +187,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         return PackNetLearner(self.policy, self.hyperparameters)
 
     def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
-        """Go to the task that these weights are of; from the second on, the rest is frozen."""
+        """Continue with the task of these weights; from the second on, biases are frozen."""
         owners = [owner for name, owner in weights.items() if name.startswith(_owner(""))]
         if owners:
             self.progress.task = 1 + max(int(owner.max()) for owner in owners)
@@ -193,7 +195,9 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
             self.learner = self.make_learner()  # its optimisers leave out what is frozen
 
     def policy_of(self, task: int) -> PackNetPolicy:
-        """Return the policy of a task up to the present one, as it was when the task ended.
+        """Return the policy of a task, as it was when the task ended.
+
+        :param task: the number of the task, from 0 to the current one
 
         :raises ValueError: a task that has not begun
         """
@@ -211,13 +215,16 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         super().reset_task()
 
     def next_task(self, env: Any, progress_bar: bool = False) -> None:
-        """Prune and retrain the weights of the present task, then begin another one.
+        """Prune and retrain the weights of the current task, then begin another one.
 
         The collected episodes are discarded, since another task has other rewards. The schedules
-        begin again.
+        start again.
 
-        :raises ValueError: the sequence has no further task, the actions have another width, or
-            the episodes to retrain on are missing; the present task goes on then
+        :param env: the environment of the next task, in any form that `set_env` takes
+        :param progress_bar: show a progress bar
+
+        :raises ValueError: the sequence has no further task, the actions have another width, or the
+            episodes to retrain on are missing; the current task then continues
         """
         tasks_left = self.hyperparameters.tasks - 1 - self.progress.task
         if tasks_left < 1:
@@ -248,7 +255,7 @@ class PackNet(DrQv2, keywords=PackNetKeywords, progress=PackNetProgress):
         self._use_env(checked)
 
     def _retrain(self, progress_bar: bool) -> None:
-        """Train the weights that the present task keeps, from its replay."""
+        """Train the weights that the current task keeps, on its replay buffer."""
         self.learner = PackNetLearner(self.policy, self.hyperparameters, self.progress.task)
         made = self.updates - self.progress.updates_before
         updates = round(made * self.hyperparameters.retrain)

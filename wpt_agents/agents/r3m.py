@@ -1,7 +1,7 @@
 """R3M (Nair et al., 2022): a frozen encoder that was pre-trained by time-contrastive learning.
 
-Source: https://arxiv.org/abs/2203.12601. Its language loss is left out, since our data have no
-words. DrQ-v2's actor and critic learn on the frozen features, as in
+Source: https://arxiv.org/abs/2203.12601. The language loss of R3M is left out, since our data
+contain no language. DrQ-v2's actor and critic learn on the frozen features, as in
 https://arxiv.org/abs/2212.05749.
 """
 
@@ -46,7 +46,7 @@ IN_MEMORY = 4e9  # bytes of images; larger datasets are read from the disk in ev
 
 
 def images_of(dataset: TrajectoryDataset) -> Callable[[int, list[int]], np.ndarray]:
-    """Return a function of a trajectory's number and some times that returns the images there."""
+    """Return a function: number of a trajectory, n times -> its images there, (n, 64, 64, 3)."""
     if (dataset.lengths + 1).sum() * 3 * dataset.image_size**2 > IN_MEMORY:
         return dataset.images
     loaded = [trajectory.image for trajectory in dataset]
@@ -62,7 +62,7 @@ class FrameFeatures(nn.Module):
     """Features of single images, and of stacks of them: the encoder that is frozen downstream.
 
     :param backbone: "conv", DrQ-v2's convolutions and a linear layer of 512, or a ResNet
-    :param channels: of the convolutions
+    :param channels: the number of channels of the convolutions
     """
 
     def __init__(self, backbone: str, channels: int) -> None:
@@ -93,11 +93,11 @@ class FrameFeatures(nn.Module):
 class R3MPolicy(DrQv2Policy):
     """DrQ-v2's actor and critic on a frozen encoder, which new tasks keep.
 
-    It has DrQ-v2's widths and `backbone`, of `FrameFeatures`.
+    Its widths are those of DrQ-v2, and `backbone` of `FrameFeatures`.
     """
 
     def make_encoder(self, channels: int) -> Any:
-        """Keep the encoder, or draw it if there is none yet."""
+        """Keep the encoder, or initialise it if there is none yet."""
         if hasattr(self, "encoder"):
             return self.encoder
         return FrameFeatures(self.widths.backbone, channels).requires_grad_(False)
@@ -115,10 +115,10 @@ class R3MLearner(DrQv2Learner):
         )
 
     def pretrain(self, clips: Tensor, others: Tensor) -> dict[str, Tensor]:
-        """One update of the encoder by `r3m_loss`.
+        """Make one update of the encoder by `r3m_loss`.
 
-        :param clips: (B, 3, 64, 64, 3), cropped
-        :param others: (K, B)
+        :param clips: (B, 3, 64, 64, 3), three images of each clip, cropped
+        :param others: (K, B), the numbers of the clips that each clip is contrasted with
         """
         encoder = self.policy.encoder.requires_grad_(True)
         z = encoder.features(clips.flatten(0, 1)).unflatten(0, clips.shape[:2])
@@ -154,7 +154,7 @@ class R3MKeywords(DrQv2Keywords):
 
 @dataclass(kw_only=True)
 class R3MProgress(FrameProgress):
-    """How far an agent has come, its pre-training included."""
+    """Counters of an `R3M` agent, including its pre-training."""
 
     pretrain_steps: int = 0
 
@@ -204,6 +204,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
     def load_weights(self, path: str | os.PathLike[str]) -> None:
         """Load the encoder's weights from a file that R3M's authors publish, such as `r3m_18.pt`.
 
+        :param path: the file
         :raises ValueError: the file has another layout, or another depth than `backbone`
         """
         body, weights = self.policy.encoder.body, read_r3m(os.fspath(path))
@@ -216,7 +217,7 @@ class R3M(DrQv2, keywords=R3MKeywords, progress=R3MProgress):
         self._features_of = None
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """Load weights and optimisers in place; what the encoder before made of images is dropped.
+        """Load weights and optimisers in place, and drop the features of the previous encoder.
 
         The parameters are those of `SavedAgent.set_parameters`.
         """

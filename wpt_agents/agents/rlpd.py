@@ -33,11 +33,12 @@ LABELS = ("true", "zero", "optimistic")
 
 
 def td_target(reward: Tensor, discount: Tensor, next_q: Tensor) -> Tensor:
-    """Target y = r + γ m Qbar_j(o', a') with one random member j; there is no entropy term.
+    """Target y = r + γ m Qbar_j(o', a') with a random member j, without an entropy term.
 
     :param reward: (N,)
-    :param discount: (N,), γ m, which is 0 behind a terminal state
-    :param next_q: (N,), of member j of the target critic
+    :param discount: (N,), γ m, which is 0 after a terminal state
+    :param next_q: (N,), the values of member j of the target critic
+    :return: (N,), y
     """
     assert reward.shape == discount.shape == next_q.shape, (reward.shape, next_q.shape)
     return reward + discount * next_q
@@ -46,8 +47,9 @@ def td_target(reward: Tensor, discount: Tensor, next_q: Tensor) -> Tensor:
 def critic_loss(q: Tensor, target: Tensor) -> Tensor:
     """E[(Q_k - y)²] over members and batch.
 
-    :param q: (K, N)
+    :param q: (K, N), the values of the K members
     :param target: (N,), y; no gradient reaches it
+    :return: scalar
     """
     assert q.shape[1:] == target.shape, (q.shape, target.shape)
     return (q - target.detach()).square().mean()
@@ -56,9 +58,10 @@ def critic_loss(q: Tensor, target: Tensor) -> Tensor:
 def actor_loss(log_prob: Tensor, q: Tensor, alpha: Tensor | float) -> Tensor:
     """E[α log π(a | o) - mean_k Q_k(o, a)].
 
-    :param log_prob: (N,)
-    :param q: (K, N)
+    :param log_prob: (N,), log π(a | o)
+    :param q: (K, N), the values of the K members
     :param alpha: the temperature; no gradient reaches it
+    :return: scalar
     """
     assert q.shape[1:] == log_prob.shape, (q.shape, log_prob.shape)
     alpha = alpha.detach() if isinstance(alpha, Tensor) else alpha
@@ -70,7 +73,8 @@ def temperature_loss(log_alpha: Tensor, log_prob: Tensor, target_entropy: float)
 
     :param log_alpha: scalar, log α
     :param log_prob: (N,); no gradient reaches it
-    :param target_entropy: Hbar, -A / 2 in RLPD
+    :param target_entropy: Hbar in nats, -A / 2 in RLPD
+    :return: scalar
     """
     return log_alpha.exp() * (-log_prob.detach().mean() - target_entropy)
 
@@ -107,11 +111,11 @@ class RLPDPolicy(FramePolicy):
     """Encoder, actor, critics, their target networks with an encoder of their own, temperature.
 
     Its widths are `channels`, `feature_dim`, `hidden_dim`, `critics` and `reward_members` of
-    `RLPDKeywords`; without the label 'optimistic' there are 0 of the latter.
+    `RLPDKeywords`; unless `label` is 'optimistic', there are 0 reward members.
     """
 
     def build(self) -> None:
-        """Draw the networks for actions of width `action_dim`."""
+        """Initialise the networks for actions of width `action_dim`."""
         widths = self.widths
         self.encoder = FrameEncoder([widths.channels * 2**i for i in range(4)], (2, 2, 2, 2))
         shape = self.encoder.embed_dim, widths.feature_dim, widths.hidden_dim, self.action_dim
@@ -130,15 +134,15 @@ class RLPDPolicy(FramePolicy):
     def decide(
         self, frames: Tensor, deterministic: bool, generator: Generator | None = None
     ) -> Tensor:
-        """(N, F, 64, 64, 3) uint8 -> (N, A): the mode or a sample of the policy."""
+        """Return the mode or a sample of the policy: (N, F, 64, 64, 3) uint8 -> (N, A)."""
         mean, log_std = self.actor(self.encoder(frames))
         return mean.tanh() if deterministic else tanh_sample(mean, log_std, generator)[0]
 
 
 class RLPDLearner:
-    """One update of encoder, critics, actor and temperature, and of the reward ensemble if any.
+    """The optimisers of all networks and of the temperature, and their updates.
 
-    :param policy: whose networks learn
+    :param policy: the networks to train
     :param settings: learning rate, τ and β
     """
 
@@ -157,9 +161,9 @@ class RLPDLearner:
     def update(
         self, batch: Transitions, online: int, generator: Generator | None = None
     ) -> Mapping[str, Tensor]:
-        """One step of every network.
+        """Take a step of every network.
 
-        :param batch: rows of the environment, then offline rows; images are shifted already
+        :param batch: rows of the environment, then offline rows, whose images are shifted already
         :param online: how many rows are of the environment
         """
         policy = self.policy

@@ -28,7 +28,7 @@ SB3_KEYWORDS: dict[str, tuple[str | None, str]] = {
 
 
 def unknown_keyword(name: str, valid: Collection[str]) -> TypeError:
-    """Return the error for an unknown keyword of an agent, with what replaces one of SB3's."""
+    """Return the error for an unknown keyword; for one of SB3, it names the replacement."""
     replacement, note = SB3_KEYWORDS.get(name, (None, ""))
     if name not in SB3_KEYWORDS or not (replacement is None or replacement in valid):
         return TypeError(str(unknown_name("keyword", name, valid)))

@@ -1,4 +1,4 @@
-"""An agent with WPT's networks: how they are made, adapted, kept for other tasks and shown."""
+"""The base of agents with WPT's networks: how the networks are made, adapted, saved and used."""
 
 import math
 import os
@@ -42,7 +42,7 @@ INITIAL_IMAGES = 128, 4  # sequences, and images of each, that a new posterior i
 class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelProgress):
     """The base of agents with a world model, an actor, a critic and a prior actor.
 
-    `WPT` adds what they learn and when.
+    `WPT` adds the training.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"WPTPolicy": WPTPolicy}
@@ -100,7 +100,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             self.learner.add_continue_head()
 
     def fit_reward_ensemble(self) -> None:
-        """Replace the further reward heads if `reward_ensemble` says another number of them."""
+        """Replace the further reward heads if `reward_ensemble` asks for another number of them."""
         model = self.policy.world_model
         number = self.hyperparameters.reward_ensemble - 1
         if len(model.reward_members) != number:
@@ -112,7 +112,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         return [self.streams.integer(Purpose.ENSEMBLE, k) for k in range(number)]
 
     def fit_networks(self, weights: Mapping[str, Tensor]) -> None:
-        """Add or remove continue head, further reward heads and imitator, as these weights say."""
+        """Add or remove continue head, further reward heads and imitator, so that weights fit."""
         if not weights:
             return
         model = self.policy.world_model
@@ -133,9 +133,9 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         tensors: Mapping[str, Mapping[str, Tensor]],
         same: tuple[str, ...],
     ) -> None:
-        """Take over a model file.
+        """Restore the weights, optimisers and counters of a model file.
 
-        Of a file that holds a world model alone, the counters of the task begin again, too.
+        If the file contains a world model alone, the counters of the task start at 0.
         """
         if WORLD_MODEL in tensors:
             before = self.progress_class.of(header["counters"])
@@ -150,12 +150,12 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         tensors: Mapping[str, Mapping[str, Tensor]],
         names: tuple[str, ...],
     ) -> None:
-        """Refuse other shapes. Heads that have learned need the bins that they learned with."""
+        """Raise a ValueError for other shapes, or other bins than heads were trained with."""
         learned = WORLD_MODEL not in tensors and header["counters"].get("updates")
         super()._check_same(header, tensors, (*names, "bin_range") if learned else names)
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """Load weights and optimisers in place; a posterior that was loaded is not adapted to data.
+        """Load weights and optimisers in place; a loaded posterior is not adapted to data.
 
         The parameters are those of `SavedAgent.set_parameters`.
         """
@@ -164,9 +164,10 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         self.choose_who_acts()
 
     def choose_who_acts(self) -> None:
-        """Let prior actor (`ibrl`, `residual`) and average actor take part as keywords say.
+        """Decide by the keywords whether prior actor and average actor take part in acting.
 
-        The prior actor does so once it is trained. An average that is switched off is dropped.
+        With `ibrl` or `residual`, the prior actor takes part once it is trained. If the average is
+        switched off, it is dropped.
         """
         self.policy.ibrl = self.hyperparameters.ibrl and self.progress.cloned
         self.policy.residual = self.hyperparameters.residual and self.progress.cloned
@@ -174,27 +175,29 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             self.policy.average(0.0)
 
     def operations(self) -> AbstractContextManager[None]:
-        """Return the context that the networks compute in, by the keyword `fast`."""
+        """Return the context in which the networks compute, which depends on the keyword `fast`."""
         return nullcontext() if self.hyperparameters.fast else definitions()
 
     # Collecting and learning
 
     @property
     def updates_per_step(self) -> float:
-        """How many updates are made for each collected step; an update replays B x T steps."""
+        """The number of updates for each collected step, of which each replays B x T steps."""
         settings = self.hyperparameters
         return settings.train_ratio / (settings.batch_size * settings.batch_length)
 
     def cheaper_updates(self, steps: int) -> str:
-        """Return an assignment with which `steps` collected steps are enough for an update."""
+        """Return a line of code that makes `steps` collected steps enough for an update."""
         settings = self.hyperparameters
         ratio = math.ceil(settings.batch_size * settings.batch_length / max(steps, 1))
         return f"model.train_ratio = {ratio}"
 
     def expected_length(self) -> int:
-        """Return a trajectory's steps: the keyword, the longest so far, the environment's, or 500.
+        """Return the expected number of steps of a trajectory, for the guidance window.
 
-        Of an episode that is cut, each part has a guidance window of its own.
+        It is the keyword `episode_length`, else the length of the longest trajectory so far, else
+        the environment's time limit, else 500, and at most `max_trajectory_length`: if an episode
+        is stored in parts, each part has a guidance window of its own.
         """
         known = self.hyperparameters.episode_length or self.progress.seen_length
         # 500 calls of `env.step` are an episode of DMControl at action repeat 2.
@@ -209,12 +212,12 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
     # The data, the task and the keywords
 
     def check_data(self, dataset: TrajectoryDataset) -> None:
-        """Refuse a dataset that WPT cannot learn from."""
+        """Raise a ValueError for a dataset that WPT cannot learn from."""
         settings = self.hyperparameters
         check_dataset(dataset, settings.max_action_dim, settings.batch_length)
 
     def check_env(self, env: VecEnv) -> None:
-        """Refuse an environment that WPT cannot act in."""
+        """Raise a ValueError for an environment that WPT cannot act in."""
         check_spaces(env, self.hyperparameters.max_action_dim, self.progress.initialised)
 
     def check_units(self) -> None:
@@ -223,14 +226,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             compare_units(self.dataset, self.action_space, self.hyperparameters.embodiment)
 
     def on_other_actions(self) -> None:
-        """Begin a new task if one was begun: its episodes and behaviour have another width."""
+        """Reset the task if one was begun, because its actions have another width."""
         if self.begun:
             with self.streams.weights(Purpose.REDRAW, self.progress.episodes, self.device):
                 self.reset_task()
 
     @property
     def begun(self) -> bool:
-        """Whether anything was done for a task."""
+        """Whether anything was collected or learnt for a task."""
         return self.progress.episodes + self.progress.cut > 0
 
     def reset_task(self) -> None:
@@ -243,7 +246,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         self.choose_who_acts()
 
     def hyperparameters_changed(self) -> None:
-        """Let the learner use the changed keywords, if they suit the dataset."""
+        """Let the learner use the changed keywords; raise a ValueError if the data forbid them."""
         if self.dataset is not None:
             self.check_data(self.dataset)
         self.learner.configure(self.hyperparameters)
@@ -281,6 +284,7 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
         """Return the index of the dataset's first images, which is kept beside the dataset.
 
         :param progress_bar: show a progress bar
+        :return: the index, a `Retriever`
         :raises ValueError: the agent has no dataset
         """
         if self.dataset is None:
@@ -290,12 +294,14 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
             return Retriever.beside(self.dataset, policy.embed, policy.encoder_id(), progress_bar)
 
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """Predict a trajectory's images, (T, 64, 64, 3) uint8, from its first images and actions.
+        """Predict a trajectory's images from its first images and all actions.
 
         :param trajectory: images to start from and actions to follow
         :param context: number of images that the model sees; these are reconstructed
         :param horizon: number of images to predict after them, at most
 
+        :return: (context + horizon, 64, 64, 3) uint8, or fewer images if the trajectory is shorter;
+            the first `context` are reconstructions
         :raises ValueError: no context, more actions than the model takes, images of another size
         """
         check_trajectory(trajectory, self.hyperparameters.max_action_dim, context)
@@ -320,12 +326,13 @@ class WorldModelAgent(PixelAgent, keywords=Hyperparameters, progress=WorldModelP
 
         :param path: a `torch.save` file of nested state dicts; it is read with `weights_only=True`
         :param env: the environment to continue with
-        :param dataset: D_off, such as the authors' folder `ncrl_datasets/dmcontrol`
+        :param dataset: data for rehearsal and guidance, such as the authors' folder
+            `ncrl_datasets/dmcontrol`
         :param stoch: groups of z, if they are not the authors' 32
         :param kwargs: further keywords of `WPT`
         :raises FileNotFoundError: no such file
-        :raises ValueError: a file that is cut short, damaged, holds more than weights or is not of
-            the authors
+        :raises ValueError: a file that is cut short or damaged, contains more than weights, or is
+            not in the authors' format
         """
         cls.check_keywords(kwargs)
         lean = cls.make_policy is WorldModelAgent.make_policy  # explorers have further networks

@@ -55,13 +55,14 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         model.set_env("wpt/dmc-walker-run-v0")
         model.learn(75_000).save("walker.zip")
 
-    `WPT("WPTPolicy", env, offline_ratio=0, guidance=0)` learns from scratch. The defaults are
-    Table 2 of the paper; steps are calls of `env.step` (2 frames each at action repeat 2).
+    `WPT("WPTPolicy", env, offline_ratio=0, guidance=0)` learns from scratch. The defaults are those
+    of Table 2 of the paper. Steps are calls of `env.step`, which are 2 frames each at action repeat
+    2.
 
     :param policy: "WPTPolicy"
     :param env: an id, a Gymnasium environment or a VecEnv with image observations and Box actions
-    :param dataset: D_off, for rehearsal and guidance: a `TrajectoryDataset`, the path of one or of
-        files in another format, a replay buffer, trajectories, or a list of these
+    :param dataset: data for rehearsal and guidance (D_off in the paper): a `TrajectoryDataset`, the
+        path of one or of files in another format, a replay buffer, trajectories, or a list of these
     :param tensorboard_log: folder of the TensorBoard events
     :param verbose: 0 for nothing, 1 for information
     :param device: "auto", "cpu", "cuda", ...
@@ -106,7 +107,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :param seed: seed of all random numbers; None: a random seed
         :param progress_bar: show a progress bar
         :param callback: called after every update with (step, metrics)
-        :param accumulate: passes over a batch, or a process's share of it, to save memory
+        :param accumulate: number of passes in which a batch, or a process's share of it, is
+            computed, to save memory
         :param kwargs: keywords of `WPT`, also `tensorboard_log`; `batch_size` is that of all
             processes and passes together
         :raises ValueError: an empty dataset, one without a trajectory as long as `batch_length`,
@@ -177,7 +179,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return self
 
     def retrieve(self, progress_bar: bool = False) -> None:
-        """Retrieve the R trajectories that begin most like the task, by Eq. (5), and read them."""
+        """Retrieve the R trajectories whose first images are most like the task's, by Eq. (5)."""
         settings = self.hyperparameters
         if not settings.retrieves:
             return
@@ -199,7 +201,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def _search(
         self, dataset: TrajectoryDataset, kept: list[Trajectory], progress_bar: bool
     ) -> None:
-        """Find the trajectories to retrieve, and drop what was made of earlier ones."""
+        """Find the trajectories to retrieve, and discard what depends on earlier ones."""
         progress = self.progress
         settings = self.hyperparameters
         outdated = self.outdated
@@ -270,27 +272,27 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     @property
     def warmup_driver(self) -> str:
-        """What chooses the actions in the warm-up, in words."""
+        """What chooses the actions in the warm-up, as words for messages."""
         guided = self.progress.cloned or (self.dataset and self.hyperparameters.needs_clone)
         return "the prior actor's actions" if guided else super().warmup_driver
 
     def guide(self, frames: np.ndarray) -> np.ndarray:
-        """Act as the prior actor, or at random without one: (k, F, 64, 64, 3) -> (k, A)."""
+        """Return the prior actor's actions, or random ones: (k, F, 64, 64, 3) uint8 -> (k, A)."""
         return prior_action(self.policy, frames) if self.progress.cloned else super().guide(frames)
 
     # // Update Models
 
     @property
     def head_start(self) -> int:
-        """Number of updates of the head start (`actor_delay`) that are left to make."""
+        """The number of updates of the head start (`actor_delay`) that remain."""
         return max(self.hyperparameters.actor_delay - self.progress.task_updates, 0)
 
     def steps_to_update(self) -> float:
-        """Return how many collected steps pay for the next update: none, if a head start is due."""
+        """Return the number of collected steps for each update, 0 while a head start is due."""
         return 0.0 if self.head_start else super().steps_to_update()
 
     def updates_due(self) -> int:
-        """Return how many updates to make now: those for the collected steps, or the head start."""
+        """Return the number of updates to make now, for the collected steps or the head start."""
         return max(super().updates_due(), self.head_start)
 
     def update(self, metrics: MetricLists) -> None:
@@ -348,8 +350,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
     def collected_returns(self) -> tuple[list[float], list[float]]:
         """Return the returns of the collected trajectories, of the warm-up and of later ones.
 
-        In replay buffers that earlier versions saved, which lack `source`, a trajectory is of the
-        warm-up if fewer than `warmup_steps` steps are stored before it.
+        Replay buffers of earlier versions do not name the source of a trajectory. There, a
+        trajectory is of the warm-up if fewer than `warmup_steps` steps are stored before it.
+
+        :return: the returns of the warm-up, and the later ones, in the order of collection
         """
         returns: tuple[list[float], list[float]] = ([], [])
         start = 0  # the number of steps that were stored before a trajectory
@@ -363,13 +367,13 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         return returns
 
     def begin_residual(self) -> None:
-        """Add what the actor learns from now on to the prior actor's action (`residual`)."""
+        """Add to the prior actor's action, from now on, what the actor learns (`residual`)."""
         if self.policy.imitator is None:
             self.policy.begin_residual()
             self.learner.begin_imitator()
 
     def averaging(self) -> float:
-        """Return the share by which the average actor moves, 0 during the head start."""
+        """Return the share by which the average actor follows the actor, 0 in the head start."""
         number = self.progress.task_updates - self.hyperparameters.actor_delay + 1
         share = self.hyperparameters.actor_average
         return debiased_fraction(share, number) if share and number > 0 else 0.0
@@ -378,14 +382,14 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     @property
     def outdated(self) -> bool:
-        """Whether the retrieved trajectories are of another dataset than the present one."""
+        """Whether the retrieved trajectories are of another dataset than the current one."""
         progress = self.progress
         other = self.dataset is not None and self.dataset.fingerprint != progress.retrieved_of
         return bool(progress.retrieved_ids) and other
 
     @property
     def begun(self) -> bool:
-        """Whether anything was done for a task."""
+        """Whether anything was collected or learnt for a task."""
         return super().begun or bool(self.progress.retrieved_ids)
 
     def reset_task(self, keep_data: bool = False) -> None:
@@ -399,7 +403,10 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :raises ValueError: `keep_data` without a dataset
         """
         if keep_data and self.dataset is None:
-            raise ValueError("keep_data=True keeps episodes beside a dataset: pass dataset= first")
+            raise ValueError(
+                "keep_data=True keeps episodes beside a dataset, and the agent has none: call "
+                "set_dataset(dataset) first"
+            )
         if keep_data:
             self.kept = self.kept or ReplayBuffer()
             for trajectory in self.replay_buffer.trajectories:
@@ -412,7 +419,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Begin the next task of a sequence with the world model and the episodes of earlier ones.
 
         The episodes are kept only if the agent has a dataset. Schedules and the count of steps
-        begin again.
+        start again.
 
         :param env: the environment of the next task, in any form that `set_env` takes
         :raises ValueError: an environment that the agent cannot act in; nothing is discarded then

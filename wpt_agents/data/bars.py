@@ -13,8 +13,8 @@ LOOK = 5.0  # seconds after which its duration is estimated
 class StageBar:
     """The progress of a stage, and how long it will still take.
 
-    Nothing is shown unasked in the first seconds. Then the bar appears if the stage, at its pace
-    so far, takes more than a minute, so that nobody waits for hours without a word.
+    Unless it is `visible`, the bar is hidden in the first seconds. Then it appears if the stage, at
+    its pace so far, takes more than a minute, so that nobody waits for long without a message.
 
     Example::
 
@@ -23,9 +23,11 @@ class StageBar:
                 convert(file)
                 bar.update()
 
-    :param total: steps of the stage
+    :param total: number of steps of the stage
+    :param name: what the stage does, shown in front of the bar
     :param visible: whether to show the bar from the start
-    :param done: steps that were made before
+    :param done: number of steps that were made before
+    :param unit: name of a step
     :param silent: whether to show nothing in any case
     """
 
@@ -58,9 +60,10 @@ class StageBar:
             self.bar.close()
 
     def update(self, steps: int = 1, values: Mapping[str, str] | None = None) -> None:
-        """Note that steps were made.
+        """Count steps that were made.
 
-        :param values: to show beside the bar
+        :param steps: their number
+        :param values: names and values to show beside the bar
         """
         self.done += steps
         if self.bar is not None:

@@ -14,7 +14,7 @@ JPEG_QUALITY = 95  # of 100; about a fourth of the images' size
 
 @dataclass(frozen=True)
 class Codec:
-    """A way to store (n, S, S, 3) uint8 images, followed by the bytes of a vector.
+    """A way to store images, (n, S, S, 3) uint8, followed by a vector of bytes.
 
     :param encode: images and vector -> the stored bytes
     :param decode: the stored bytes and the size of the vector -> the images' bytes, followed by
@@ -58,7 +58,7 @@ CODECS = {
 def find_codec(name: str) -> Codec:
     """Return the codec of this name.
 
-    :raises ValueError: there is none
+    :raises ValueError: there is no such codec
     """
     if name not in CODECS:
         raise unknown_name("codec", name, CODECS)

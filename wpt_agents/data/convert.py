@@ -1,7 +1,7 @@
-"""Make a dataset of anything that can serve as one: `open_dataset`, and the conversions.
+"""Make a dataset from anything that can serve as one: `open_dataset`, and the conversions.
 
 This module assigns `TrajectoryDataset.of`, `TrajectoryDataset.from_npz` and the other constructors;
-the class itself knows no other format.
+the module of the class itself knows no other format.
 """
 
 import hashlib
@@ -54,6 +54,7 @@ def open_dataset(data: Data) -> TrajectoryDataset:
     - A list of any of these: a view of all as one dataset.
 
     :param data: one of these
+    :return: the dataset
     :raises ValueError: anything else; the message says what it is and what to do
     """
     if isinstance(data, TrajectoryDataset):
@@ -85,7 +86,7 @@ def open_dataset(data: Data) -> TrajectoryDataset:
 
 
 def _checked(data: Any) -> Iterator[Trajectory]:
-    """The trajectories of an iterable; anything else in it, or in its place, is refused."""
+    """Yield the trajectories of an iterable; raise a ValueError for anything else."""
     refuse_object(data)
     for i, item in enumerate(data):
         if not isinstance(item, Trajectory):
@@ -97,9 +98,9 @@ def _checked(data: Any) -> Iterator[Trajectory]:
 
 
 def refuse_object(data: Any) -> None:
-    """Refuse objects that are no dataset by what they are, with the remedy.
+    """Raise a ValueError with advice for objects that are often mistaken for a dataset.
 
-    :raises ValueError: it is one of them
+    :raises ValueError: a dictionary, an array, arrays or an environment, for example
     """
     kind = type(data).__name__
     make = "make Trajectory(image, action) of each episode and pass their list"
@@ -126,7 +127,7 @@ def refuse_object(data: Any) -> None:
 
 
 class TemporaryFolder:
-    """A folder that is removed with the last of the datasets that read it, copies included."""
+    """A folder that is removed with the last dataset that reads it, copies included."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="wpt_dataset_"))
@@ -137,7 +138,7 @@ class TemporaryFolder:
 
 
 def _stored(trajectories: Iterable[Trajectory]) -> TrajectoryDataset:
-    """A dataset in a temporary folder, which is removed with it and its copies."""
+    """Return a dataset in a temporary folder, which is removed with it and its copies."""
     folder = TemporaryFolder()
     dataset = TrajectoryDataset.create(folder.path)
     dataset._whole = folder
@@ -182,8 +183,9 @@ def from_episodes(
     :param episodes: trajectories by number, such as a reader of a format
     :param path: the folder of the dataset
     :param progress_bar: show a progress bar
-    :raises ValueError: the dataset there does not begin with these episodes, or an episode cannot
-        be converted; those before it are kept
+    :return: the dataset
+    :raises ValueError: the dataset at `path` does not begin with these episodes, or an episode
+        cannot be converted; the episodes before it are kept
     """
     dataset = TrajectoryDataset.open_or_create(path, episodes.image_size)
     ranges = Ranges()
@@ -218,7 +220,7 @@ def _count_done(dataset: TrajectoryDataset, episodes: Episodes, path: Source) ->
 
 
 def _same(dataset: TrajectoryDataset, read: Trajectory) -> bool:
-    """Whether a dataset's last trajectory is `read`; different sources may have the same names."""
+    """Return whether `read` is a dataset's last trajectory; names of sources are not unique."""
     stored = dataset[-1]
     return (
         _label(stored) == _label(read)
@@ -234,7 +236,7 @@ def _label(trajectory: Trajectory) -> tuple[Any, ...]:
 
 
 def cache_folder(source: Source) -> Path:
-    """The folder for the conversion of `source`; another one as soon as a file of it changes.
+    """Return the folder for the conversion of `source`, another one if a file of it changes.
 
     It is in `$XDG_CACHE_HOME/wpt_agents`, or `~/.cache/wpt_agents`; its content may be deleted.
     """
@@ -264,6 +266,7 @@ def convert(
     :param progress_bar: show a progress bar
     :param form: a name in `FORMATS`; recognised by default
     :param options: keywords of the format's reader, such as `image_key` or `low` and `high`
+    :return: the dataset
     :raises ValueError: data or options that cannot be used, or another dataset at `path`
     """
     return from_episodes(open_episodes(source, form, **options), path, progress_bar)

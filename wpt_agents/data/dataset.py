@@ -79,7 +79,7 @@ class TrajectoryDataset(StoredTrajectories):
         self._resize = Resizer(self.image_size, crop_option="append(trajectory, crop=True)")
 
     def __repr__(self) -> str:
-        """The folder, counts, robots and the numbers of their actions."""
+        """The folder, counts, robots and the widths of their actions."""
         robots = sorted({name or "unnamed" for name in self.embodiments})
         return (
             f"<{type(self).__name__} {str(self.path)!r}: {len(self)} trajectories, "
@@ -99,10 +99,11 @@ class TrajectoryDataset(StoredTrajectories):
 
         :param path: the folder
         :param image_size: height and width of the images, to which others are resized
-        :param codec: "zstd" (lossless, a sixth of the size for simulated images), "raw", or "jpeg"
-            (lossy, a fourth of the size; for camera images, whose noise zstd cannot compress)
+        :param codec: "zstd" (lossless, about a sixth of the size for simulated images), "raw", or
+            "jpeg" (lossy, about a fourth of the size; for camera images, whose noise zstd cannot
+            compress)
         :param workers: number of threads that decompress
-        :raises ValueError: an unknown codec, or a folder with something in it
+        :raises ValueError: an unknown codec, or a folder that is not empty
         """
         find_codec(codec)
         create_folder(Path(path).expanduser(), Meta(image_size, codec))
@@ -205,7 +206,7 @@ class TrajectoryDataset(StoredTrajectories):
         :param trajectory: with images of any size, as `Trajectory` describes them
         :param crop: cut out the middle square of images that are not square, instead of squeezing
         :raises ValueError: non-zero numbers in the actions' padding, a read-only view, or another
-            process that writes
+            process that is writing to the folder
         """
         if trajectory.image.shape[1:3] != (self.image_size, self.image_size):
             self._resize.crop = crop
@@ -245,7 +246,7 @@ class TrajectoryDataset(StoredTrajectories):
             other._windows = None
 
     def reserve(self) -> None:
-        """Take the write lock now, not at the first append, and see what others appended.
+        """Take the write lock now, not at the first append, and read what others appended.
 
         :raises ValueError: another process writes, or this is a read-only view
         """
@@ -277,7 +278,7 @@ class TrajectoryDataset(StoredTrajectories):
         self._threads.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copies and pickles read the same folder; the right to write is not copied."""
+        """Return the state for copies and pickles, which read the same folder without the lock."""
         return {**vars(self), "_writer": None}
 
     def __enter__(self) -> "TrajectoryDataset":
@@ -289,7 +290,8 @@ class TrajectoryDataset(StoredTrajectories):
     def info(self) -> dict[str, Any]:
         """Return counts of trajectories, transitions, robots, tasks and bytes as a dictionary.
 
-        `compression` is the ratio of the images' raw size to the stored size, actions included.
+        `compression` is the ratio of the raw size of the images to the stored size, which includes
+        actions and rewards.
         """
         return describe(self._folders, self._entries)
 
@@ -303,8 +305,9 @@ class TrajectoryDataset(StoredTrajectories):
 
         :param progress_bar: show a progress bar
         :param set_aside: exclude the damaged ones, here and for everybody who opens the folder from
-            now on; the trajectories after them move up in number. The file `damaged.json` in the
+            now on; the trajectories after them get lower numbers. The file `damaged.json` in the
             folder lists them; delete it to include them again
+        :return: the number and the damage of each damaged trajectory
         """
         damaged = find_damage(self._reason, len(self), self._threads.map, progress_bar)
         if set_aside and damaged:
@@ -317,7 +320,7 @@ class TrajectoryDataset(StoredTrajectories):
         return damaged
 
     def _reason(self, i: int) -> str | None:
-        """Why trajectory `i` cannot be read, or None."""
+        """Return why trajectory `i` cannot be read, or None."""
         try:
             self[i]
         except ValueError as error:

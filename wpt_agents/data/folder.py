@@ -1,4 +1,4 @@
-"""One folder of trajectories as a reader sees it: whole trajectories, or the blocks of a part."""
+"""A folder of trajectories for a reader: whole trajectories, or the blocks of a part."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from wpt_agents.data.trajectory import Trajectory
 
 
 class Part(Trajectory):
-    """Some steps of a trajectory; the whole was checked when it was appended."""
+    """Some steps of a trajectory, which are not checked again."""
 
     def __post_init__(self) -> None:
         pass
@@ -30,7 +30,7 @@ class Folder(NamedTuple):
     def read(self, entry: Entry, start: int, stop: int) -> tuple[Trajectory, int, int]:
         """Read the blocks that hold images `start` .. `stop - 1`.
 
-        :return: the blocks as a trajectory, and where `start` and `stop` stand in it
+        :return: the blocks as a trajectory, and the positions of `start` and `stop` in it
         :raises OSError: a block cannot be read or is damaged
         """
         # The action and reward that led to image `start` are stored with the image before it.

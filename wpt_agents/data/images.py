@@ -1,4 +1,4 @@
-"""Images of any size become images of the size that a model sees, by one function for all."""
+"""The one place where images are resized to the size that a model sees."""
 
 import warnings
 from functools import lru_cache
@@ -37,7 +37,7 @@ def resized(images: np.ndarray, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def area_weights(old: int, new: int) -> Tensor:
-    """(new, old): the share of each old pixel in each new one along an axis; the rows sum to 1."""
+    """Return the share of each old pixel in each new one along an axis: (new, old)."""
     edges = torch.arange(new + 1, dtype=torch.float64) * old / new
     pixel = torch.arange(old, dtype=torch.float64)
     overlap = torch.minimum(edges[1:, None], pixel + 1) - torch.maximum(edges[:-1, None], pixel)
@@ -46,13 +46,13 @@ def area_weights(old: int, new: int) -> Tensor:
 
 
 def middle_square(images: np.ndarray) -> np.ndarray:
-    """The square in the middle of each image: (N, H, W, 3) -> (N, S, S, 3) with S = min(H, W)."""
+    """Cut out the middle square of images: (N, H, W, 3) -> (N, S, S, 3) with S = min(H, W)."""
     rows, columns = middle(*images.shape[1:3])
     return images[:, rows, columns]
 
 
 def middle(height: int, width: int) -> tuple[slice, slice]:
-    """The rows and columns of the square in the middle of an image."""
+    """Return the rows and columns of the square in the middle of an image."""
     side = min(height, width)
     top = (height - side) // 2
     left = (width - side) // 2
@@ -62,10 +62,10 @@ def middle(height: int, width: int) -> tuple[slice, slice]:
 def resize_message(
     height: int, width: int, size: int, crop_option: str = "", cut: str | None = None
 ) -> str:
-    """The sentence to say when images are resized, with a crop that keeps their proportions.
+    """Return the warning that images are resized, with advice how to keep their proportions.
 
-    :param crop_option: how to have the middle cut out, if the caller has an option for it
-    :param cut: the code that cuts the middle out; of channels-last images if None, and if "" none,
+    :param crop_option: the caller's option for cutting out the middle, if there is one
+    :param cut: code that cuts out the middle; None for that of channels-last images, "" for none,
         because the images may be laid out differently
     """
     if height == width:
@@ -83,11 +83,11 @@ def resize_message(
 
 
 class Resizer:
-    """Brings images to one size, and warns once for each shape that comes.
+    """Resize images to one size, and warn once for each original shape.
 
     :param size: height and width of the result
     :param crop: cut out the middle square instead of squeezing
-    :param crop_option: how a user asks for `crop`, for the warning
+    :param crop_option: the user's option for `crop`, for the warning
     :param cut: of `resize_message`
     """
 
@@ -98,7 +98,7 @@ class Resizer:
         self._warned: set[tuple[int, int]] = set()
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
-        """(N, H, W, 3) uint8 -> (N, size, size, 3) uint8."""
+        """Resize images: (N, H, W, 3) uint8 -> (N, size, size, 3) uint8."""
         if self.crop:
             images = middle_square(images)
         height, width = images.shape[1:3]

@@ -36,8 +36,8 @@ class Meta:
 class Entry:
     """A trajectory's line in the index.
 
-    :param blocks: the blocks' sizes in bytes, separated by spaces: parsing 60,000 JSON lists
-        would take a second
+    :param blocks: the blocks' sizes in bytes, separated by spaces, because parsing 60,000 JSON
+        lists would take a second
     :param checksum: CRC-32 of the blocks' own; None in datasets of older versions
     :param bounds: lowest and highest values of the actions in the robot's own units, if known
     """
@@ -92,7 +92,7 @@ def create_folder(path: Path, meta: Meta) -> None:
 
 
 def _left_by_create(file: Path) -> bool:
-    """Whether the file may be left over from a `create_folder` that was killed halfway."""
+    """Return whether the file may be left over from a `create_folder` that was killed."""
     empty = file.name in ("index.jsonl", CONVERT_LOCK) and file.stat().st_size == 0
     return empty or file.name.startswith(".meta.json.tmp-")
 
@@ -116,7 +116,7 @@ def read_meta(path: Path) -> Meta:
     if meta["version"] > VERSION:
         raise ValueError(
             f"{path} is a dataset of version {meta['version']}, this program reads up to "
-            f"{VERSION}; upgrade wpt-agents"
+            f"{VERSION}; update wpt_agents"
         )
     return Meta(meta["image_size"], meta["codec"])
 

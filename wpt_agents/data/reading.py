@@ -24,11 +24,11 @@ PAUSES = (1.0, 4.0, 15.0)  # seconds between attempts to read a folder that has 
 class StoredTrajectories:
     """Trajectories in one folder or several; only their index is kept in memory.
 
-    :param folders: all with images of one size
+    :param folders: folders whose images all have the same size
     :param entries: the index's lines, in the order of the trajectories
     :param folder_of: for each trajectory, the number of its folder; all are in the first if None
     :param ids: the number of each trajectory in its own folder, for a read-only view
-    :param workers: threads that decompress; they pay off only where cores are free
+    :param workers: threads that decompress; they help only if there are idle cores
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class StoredTrajectories:
 
     @property
     def lengths(self) -> np.ndarray:
-        """(N,) int, the number of actions of each trajectory."""
+        """The number of actions of each trajectory, (N,) int."""
         return np.array([entry.length for entry in self._entries], np.int64)
 
     @property
     def action_dims(self) -> np.ndarray:
-        """(N,) int, the true action width of each trajectory."""
+        """The true action width of each trajectory, (N,) int."""
         return np.array([entry.action_dim for entry in self._entries], np.int64)
 
     @property
@@ -98,7 +98,7 @@ class StoredTrajectories:
 
     @property
     def bounds(self) -> list[list[list[float]] | None]:
-        """What -1 and 1 stand for in each trajectory, [lowest, highest]; None where unknown."""
+        """The values that -1 and 1 stand for in each trajectory, [lowest, highest], or None."""
         return [entry.bounds for entry in self._entries]
 
     @property
@@ -134,7 +134,7 @@ class StoredTrajectories:
     def subset(self, indices: Sequence[int] | np.ndarray) -> Self:
         """Return a read-only view of some trajectories, in the order of `indices`.
 
-        :param indices: their numbers, or a mask: a bool for each trajectory
+        :param indices: the numbers of the trajectories, or a mask: a bool for each trajectory
         :raises ValueError: a mask of another length
         """
         chosen = np.asarray(indices, None if len(indices) else int)
@@ -190,7 +190,8 @@ class StoredTrajectories:
         :param action_width: width to which actions are padded; `max_action_dim` by default
         :param rng: source of the random numbers; by default, every call draws other sequences
         :param share: the rows that are read, for one of several processes
-        :param mark: return a `MarkedBatch`; it reads each trajectory once as a whole
+        :param mark: return a `MarkedBatch`; for this, each trajectory is read once as a whole
+        :return: (B, T) sequences
         :raises ValueError: an empty dataset, a damaged trajectory, or one with more actions than
             `action_width`
         """
@@ -249,11 +250,11 @@ class StoredTrajectories:
         return self._folders[0 if self._folder_of is None else self._folder_of[i]]
 
     def _id(self, i: int) -> int:
-        """The number of trajectory `i` in its own folder."""
+        """Return the number of trajectory `i` in its own folder."""
         return int(i) % len(self) if self._ids is None else self._ids[i]
 
     def _read(self, piece: Piece) -> tuple[Trajectory, int, int]:
-        """Read the blocks that a piece lies in, as a trajectory, and the piece's place therein."""
+        """Read the blocks of a piece as a trajectory, and return the piece's place in it."""
         i, start, stop = piece
         return self._attempt(i, lambda folder, entry: folder.read(entry, start, stop))
 

@@ -1,4 +1,4 @@
-"""The offline data that a baseline uses: trajectories of its own task, or else of its own robot."""
+"""The offline data of a baseline: trajectories of its task, or else of its robot."""
 
 import numpy as np
 
@@ -13,12 +13,15 @@ def related_trajectories(
     most: int,
     rng: np.random.Generator,
 ) -> list[int]:
-    """Return the numbers of the trajectories that bear the task's name, or else the robot's.
+    """Return the numbers of the trajectories of the task or, if there are none, of the robot.
 
     The paper's baselines use "only task-related data". Exploration data of DMControl name no task,
     so there the robot decides. Trajectories of another action width are never used.
 
-    :param most: if there are more, this many are drawn at random
+    :param task: the name of the task, or None
+    :param embodiment: the name of the robot, or None
+    :param action_dim: the width of the actions
+    :param most: the largest number of trajectories; if there are more, they are drawn at random
     :raises ValueError: the dataset holds neither; the message lists what it holds
     """
     own_width = [width == action_dim for width in dataset.action_dims]

@@ -66,7 +66,7 @@ class ReplayBuffer:
         :param length: T, number of images in a sequence
         :param action_width: A, width to which actions are padded
         :param rng: source of the random numbers
-        :param mark: return a `MarkedBatch`, which marks what moves
+        :param mark: return a `MarkedBatch`, which marks the pixels that move
         :return: (B, T) sequences
         :raises ValueError: an empty buffer, or a trajectory with more actions than `action_width`
         """
@@ -127,20 +127,20 @@ def mix(
     recent_share: float = 0.0,
     mark: bool = False,
 ) -> Batch:
-    """Experience rehearsal: a batch of `online`, then `batch_size * ratio` rows of `retrieved`.
+    """Draw a batch for experience rehearsal: rows of `online`, then of `retrieved`.
 
     The rewards of `retrieved` belong to other tasks or to none, so they are masked.
 
     :param online: the task's episodes
     :param retrieved: the retrieved trajectories, None for no rehearsal
-    :param ratio: share of the rows that are retrieved, in [0, 1]
+    :param ratio: share of the rows that are of `retrieved`, in [0, 1]
     :param batch_size: B, number of sequences
     :param length: T, number of images in a sequence
     :param action_width: A, width to which actions are padded
     :param rng: source of the random numbers
-    :param recent_share: share of the online rows that come from the newest episodes, which uniform
-        replay shows least often
-    :param mark: return a `MarkedBatch`, which marks what moves
+    :param recent_share: share of the online rows that are drawn from the five newest episodes,
+        which uniform replay has drawn least often
+    :param mark: return a `MarkedBatch`, which marks the pixels that move
     :return: (B, T) sequences
     :raises ValueError: a ratio outside [0, 1]
     """

@@ -1,4 +1,4 @@
-"""Experience retrieval, Eq. (5): the trajectories that begin most like the task does.
+"""Experience retrieval, Eq. (5): the trajectories whose first images are most like the task's.
 
 Example::
 
@@ -26,10 +26,10 @@ class Retriever:
     """The features e(o_0) of every trajectory's first image, searched exactly.
 
     :param features: (N, E) float32
-    :param action_dims: (N,) int
-    :param embodiments: N names, None where unknown
-    :param encoder_id: which encoder made the features, e.g. a hash of its weights
-    :param dataset_id: of which trajectories, e.g. the dataset's fingerprint
+    :param action_dims: (N,) int, the widths of the actions
+    :param embodiments: N names of robots, None where unknown
+    :param encoder_id: an identifier of the encoder of the features, such as a hash of its weights
+    :param dataset_id: an identifier of the trajectories, such as the dataset's fingerprint
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Retriever:
 
         :param dataset: the trajectories
         :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
-        :param encoder_id: which encoder `embed` is, such as a hash of its weights
+        :param encoder_id: an identifier of the encoder, such as a hash of its weights
         :param progress_bar: show a progress bar
         """
         features = np.zeros((len(dataset), 0), np.float32)
@@ -91,11 +91,11 @@ class Retriever:
     ) -> "Retriever":
         """Load the index in the dataset's folder; build it if missing, damaged or out of date.
 
-        The index of a subset is built each time, since the folder holds that of the whole dataset.
+        The index of a subset is always built, since the folder stores that of the whole dataset.
 
         :param dataset: the trajectories
         :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32
-        :param encoder_id: which encoder `embed` is, such as a hash of its weights
+        :param encoder_id: an identifier of the encoder, such as a hash of its weights
         :param progress_bar: show a progress bar
         """
         # Named by its encoder, so that models do not overwrite each other's index.
@@ -132,11 +132,11 @@ class Retriever:
         :param embed: (E,), the features of the task's first observation, or (Q, E), those of the
             first observations of Q episodes, which take their nearest trajectories in turns
         :param k: number of trajectories
-        :param embodiment: only trajectories of this name, or of none
+        :param embodiment: only trajectories of this robot, or that name none
         :param action_dim: only trajectories of this action width
-        :return: indices (k',) and distances (k',) to the query that found each, nearest first (of
-            several queries: all that are a query's nearest, then all second ones, and so on);
-            k' < k if there are no more
+        :return: indices (k',) and their distances (k',) to the query that found them, nearest
+            first; k' < k if there are no more. With several queries, the nearest trajectories of
+            all queries come first, then the second nearest, and so on
         """
         queries = np.ascontiguousarray(np.atleast_2d(embed), np.float32)
         if queries.ndim != 2 or queries.shape[1:] != self.features.shape[1:]:
@@ -161,7 +161,7 @@ class Retriever:
 
         :param k: number of trajectories
         :param rng: source of the random numbers
-        :param embodiment: only trajectories of this name, or of none
+        :param embodiment: only trajectories of this robot, or that name none
         :param action_dim: only trajectories of this action width
         :return: indices (k',); k' < k if there are no more
         """
@@ -172,9 +172,9 @@ class Retriever:
         """Measure how well the features alone distinguish robots.
 
         :param k: number of neighbours
-        :param queries: how many named trajectories to search for, evenly spread
-        :return: the share of their `k` nearest named others that are of the same name; None where
-            fewer than two robots are named
+        :param queries: number of trajectories with a name to use as queries, evenly spread
+        :return: the share of robots of the same name among the `k` nearest other trajectories with
+            a name; None if fewer than two robots are named
         """
         named = [i for i, name in enumerate(self.embodiments) if name is not None]
         names = np.array(self.embodiments)[named]
@@ -213,7 +213,7 @@ class Retriever:
         """Read a file of `save`.
 
         :param path: the file
-        :param encoder_id: which encoder the features must be of
+        :param encoder_id: the identifier of the encoder that the features must be of
         :raises ValueError: an index of another encoder, or a damaged file
         """
         head, arrays = load_arrays(path, "Retriever")

@@ -7,7 +7,7 @@
 
 A block holds the images of 16 steps, then the actions taken at them, then their rewards. A line is
 appended to the index after its blocks are on the disk. So a writer that is killed at any moment
-leaves at most bytes without a line, which the next writer removes. Only one writer can hold the
+leaves at most blocks without a line, which the next writer removes. Only one writer can have the
 lock; readers need none.
 """
 
@@ -181,7 +181,7 @@ class Writer:
         return entry
 
     def flush(self) -> None:
-        """Force the index to the disk, so that what was appended survives a power cut."""
+        """Flush the index to the disk, so that appended trajectories survive a power failure."""
         os.fsync(self._index.fileno())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Threads that read ahead and beside: decompression releases Python's lock, so threads suffice."""
+"""Threads that read in parallel and in advance, as decompression releases Python's global lock."""
 
 import os
 from collections import deque
@@ -14,7 +14,7 @@ Out = TypeVar("Out")
 class Threads:
     """A `map` over a number of threads, which are started on first use.
 
-    :param workers: how many; 0 for the plain `map`
+    :param workers: number of threads; 0 for the plain `map`
     """
 
     def __init__(self, workers: int) -> None:
@@ -23,7 +23,7 @@ class Threads:
         self._owner = 0
 
     def __reduce__(self) -> tuple[type["Threads"], tuple[int]]:
-        """Copies and pickles start threads of their own."""
+        """Let copies and pickles start threads of their own."""
         return type(self), (self.workers,)
 
     def map(self, function: Callable[[In], Out], items: Iterable[In]) -> Iterable[Out]:
@@ -45,7 +45,7 @@ class Threads:
 def prefetched(draw: Callable[[int], Out], start: int, ahead: int) -> Generator[Out, None, None]:
     """Yield draw(start), draw(start + 1), ... without end.
 
-    :param ahead: how many results are prepared in the background
+    :param ahead: number of results that are prepared in the background
     """
     with ThreadPoolExecutor(1, "batches") as pool:
         waiting = deque(pool.submit(draw, k) for k in range(start, start + ahead + 1))

@@ -117,7 +117,7 @@ class Trajectory:
 
     @cached_property
     def background(self) -> np.ndarray:
-        """The median of 51 evenly spaced images, (H, W, 3) uint8: what does not move."""
+        """The background: the median of 51 evenly spaced images, (H, W, 3) uint8."""
         times = np.linspace(0, len(self.image) - 1, min(GLANCES, len(self.image))).round()
         median: np.ndarray = np.median(self.image[times.astype(int)], 0)
         return median.astype(np.uint8)
@@ -130,7 +130,7 @@ class Trajectory:
 
 
 def check_range(action: np.ndarray) -> None:
-    """Refuse actions outside [-1, 1], with the range that was found and the remedy.
+    """Raise a ValueError for actions outside [-1, 1], with their range and the remedy.
 
     :param action: (T, A)
     :raises ValueError: an action that is not finite, or is outside [-1, 1]
@@ -150,10 +150,10 @@ def check_range(action: np.ndarray) -> None:
 
 
 def check_finite(action: np.ndarray) -> None:
-    """Refuse actions that are NaN or infinite.
+    """Raise a ValueError for actions that are NaN or infinite.
 
     :param action: (T, A)
-    :raises ValueError: names the first of them
+    :raises ValueError: an action that is not finite; the message names the first one
     """
     if not np.isfinite(action).all():
         t, i = np.argwhere(~np.isfinite(action))[0]
@@ -168,10 +168,11 @@ class Batch:
     """(B, T) sequences as the RSSM takes them: each image with the action and reward before it.
 
     :param image: (B, T, 64, 64, 3) uint8
-    :param action: (B, T, A) float32, what led to `image`; zeros where `is_first` and in the padding
-    :param reward: (B, T) float32, what came with `image`; 0 where unknown
+    :param action: (B, T, A) float32, the action that led to `image`; zeros where `is_first` and in
+        the padding
+    :param reward: (B, T) float32, the reward of the action that led to `image`; 0 where unknown
     :param is_first: (B, T) bool, where the recurrent state and the previous action are reset
-    :param is_terminal: (B, T) bool, the image is a terminal state
+    :param is_terminal: (B, T) bool, whether the image is a terminal state
     :param reward_known: (B, T) bool, where the reward head may learn
     """
 
@@ -187,7 +188,7 @@ class Batch:
         assert len(set(shapes.values())) == 1, shapes
 
     def to(self, device: torch.device | str) -> "Batch":
-        """Return the batch on `device`; a copy from pinned memory runs beside the computation."""
+        """Return the batch on `device`; from pinned memory, the copy is asynchronous."""
         pinned = self.image.is_pinned()
         return replace(
             self,
@@ -209,7 +210,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class MarkedBatch(Batch):
-    """A batch that marks what moves: the pixels that differ from their trajectory's background.
+    """A batch that marks moving pixels, which differ from their trajectory's background.
 
     :param moving: (B, T, 64, 64) bool
     """
@@ -235,9 +236,9 @@ def led_to(trajectory: Trajectory, start: int, stop: int, width: int) -> dict[st
 
     This is the only place where actions and rewards are shifted against images.
 
-    :param width: the agent's action width, `max_action_dim`; entries past the embodiment's own
-        `action_dim` are zero, whatever the trajectory holds there
-    :return: the streams of a Batch for one sequence: (stop - start, ...) arrays
+    :param width: the agent's action width, `max_action_dim`; entries past the trajectory's
+        `action_dim` become zero
+    :return: the fields of a Batch for one sequence: arrays (stop - start, ...)
     """
     length = len(trajectory)
     used = trajectory.action_dim

@@ -1,7 +1,7 @@
 """n-step transitions of stacked frames, drawn from whole episodes: the batches of DrQ-v2 and RLPD.
 
-An episode is stored once. A transition's six frames are looked up when it is drawn, so a replay of
-75,000 steps takes 0.9 GB where one that stores stacked observations takes 5.5 GB.
+An episode is stored once. A transition's six frames are looked up when it is drawn, so a replay
+buffer of 75,000 steps takes 0.9 GB, where one that stores stacked observations takes 5.5 GB.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ from wpt_agents.data.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Transitions:
-    """N steps of behaviour and what came of each within n steps.
+    """N transitions over n steps: what was done at step s, and what followed until step s + n.
 
-    :param image: (N, F, 64, 64, 3) uint8, the frames up to o_s, oldest first; or features of them
+    :param image: (N, F, 64, 64, 3) uint8, the frames up to o_s, oldest first; or their features
     :param action: (N, A) float32, a_s
     :param reward: (N,) float32, R of `n_step_return`; 0 where rewards are unknown
     :param discount: (N,) float32, D of `n_step_return`, the weight of the value at `next_image`
@@ -40,7 +40,7 @@ class Transitions:
         return len(self.action)
 
     def to(self, device: torch.device | str) -> "Transitions":
-        """The same transitions on `device`."""
+        """Return the same transitions on `device`."""
         return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
@@ -52,8 +52,8 @@ class Steps:
     :param action: (N, H, A) float32
     :param reward: (N, H) float32
     :param end: (N, H) float32, 1 where the step led to a terminal state
-    :param inside: (N, H) float32, 0 for steps behind the end of the episode
-    :param next_image: (N, H, F, 64, 64, 3) uint8, the frames up to what each step led to
+    :param inside: (N, H) float32, 0 for steps after the end of the episode
+    :param next_image: (N, H, F, 64, 64, 3) uint8, the frames up to the image that each step led to
     """
 
     image: Tensor
@@ -64,7 +64,7 @@ class Steps:
     next_image: Tensor
 
     def to(self, device: torch.device | str) -> "Steps":
-        """The same steps on `device`."""
+        """Return the same steps on `device`."""
         return Steps(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
@@ -98,15 +98,15 @@ def cut_shifted(image: np.ndarray, offset: np.ndarray, pad: int) -> np.ndarray:
 
 
 def concatenate(parts: Sequence[Transitions]) -> Transitions:
-    """The rows of all parts, in order."""
+    """Return the rows of all parts, in order."""
     names = [f.name for f in fields(Transitions)]
     return Transitions(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})
 
 
 def n_step_return(reward: np.ndarray, gamma: float, terminated: bool) -> tuple[float, float]:
-    """R = Σ_i γ^i r_i, and D = γ^n, or D = 0 if the last step led to a terminal state.
+    """Return R = Σ_i γ^i r_i and D = γ^n, or D = 0 if the last step led to a terminal state.
 
-    A time limit is no terminal state: its last image is bootstrapped from like any other.
+    A time limit is no terminal state: the value of the last image counts.
 
     :param reward: (n,), the rewards of the steps s .. s + n - 1
     :return: R and D of the target R + D Q(o_{s+n})
@@ -129,17 +129,18 @@ def draw_transitions(
 ) -> Transitions:
     """Draw transitions whose n steps lie inside one episode, every start equally likely.
 
-    Before an episode's third image its first one stands for those that are missing, as in acting.
-    A part of a long episode is drawn from like an episode, though in acting its images go on.
-    Episodes shorter than n steps are drawn whole. DrQ-v2 draws an episode and then a start in it,
-    which is the same where all episodes are equally long.
+    Before an episode's third image, copies of its first image replace those that are missing, as in
+    acting. A part of a long episode is treated like an episode, although in acting its first images
+    are preceded by others. Episodes shorter than n steps are drawn whole. DrQ-v2 draws an episode
+    and then a start in it, which is the same where all episodes are equally long.
 
     :param size: N, the number of transitions
     :param n_steps: n, at least 1
     :param action_dim: A; narrower actions are padded with zeros
-    :param pad: pixels by which `image` and `next_image` are shifted at most, independently
+    :param pad: largest shift of `image` and `next_image` in pixels, drawn independently
     :param frames: F, the images in a stack
-    :param seen: for each trajectory what stands for its images, (T + 1, ...), such as features
+    :param seen: for each trajectory an array (T + 1, ...) that replaces its images, such as their
+        features
     :param tails: whether the last n - 1 steps of an episode that terminated are starts, too: no
         rewards follow its end, so sums of fewer rewards are complete there
     :raises ValueError: there is no trajectory
@@ -183,14 +184,14 @@ def draw_steps(
     pad: int = 0,
     frames: int = 3,
 ) -> Steps:
-    """Draw steps in a row, every first step equally likely.
+    """Draw sequences of H steps, every first step equally likely.
 
     An episode may end before the last of the H steps; its last step is then repeated.
 
     :param size: N
     :param horizon: H
     :param action_dim: A; narrower actions are padded with zeros
-    :param pad: pixels by which each stack of frames is shifted at most, independently
+    :param pad: largest shift of each stack of frames in pixels, drawn independently
     :param frames: F, the images in a stack
     :raises ValueError: there is no trajectory
     """

@@ -1,9 +1,9 @@
 """The units of actions: from a robot's own values to [-1, 1], and whether data and task agree.
 
-All actions here are in [-1, 1]. What -1 and 1 stand for, the *bounds*, is known for data of formats
-that have an action space, or if the user gave `low` and `high`. Data whose actions were taken as
-they are may silently be in other units: a gripper stored as 0 and 1 would be read as half open and
-open. So such data are questioned where they are imported, and compared with the task's Box.
+All actions of a dataset are in [-1, 1]. What -1 and 1 stand for, the *bounds*, is known for data of
+formats that have an action space, or if the user passed `low` and `high`. Actions that were
+imported without rescaling may be in other units: a gripper stored as 0 and 1 would be read as half
+open and open. So the import warns of such data, and they are compared with the task's Box.
 """
 
 import warnings
@@ -21,7 +21,7 @@ ENOUGH = 20  # actions; the range of fewer says nothing
 
 
 def both_limits(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """The limits of the actions as arrays, or None if neither is set.
+    """Return the limits of the actions as arrays, or None if neither is set.
 
     :raises ValueError: one without the other, or a lowest value above the highest
     """
@@ -47,6 +47,7 @@ def rescaled(action: np.ndarray, low: Any, high: Any) -> np.ndarray:
     :param action: (T, A)
     :param low: (A,)
     :param high: (A,)
+    :return: (T, A)
     """
     low = np.asarray(low, np.float64)
     high = np.asarray(high, np.float64)
@@ -73,7 +74,7 @@ class Ranges:
         self._ranges: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take a trajectory into account, unless its bounds are known."""
+        """Add a trajectory, unless its bounds are known."""
         if trajectory.bounds is not None:
             return
         action = trajectory.action[:, : trajectory.action_dim]
@@ -103,8 +104,11 @@ class Ranges:
 def compare_units(dataset: Any, box: spaces.Box, embodiment: str | None = None) -> None:
     """Warn if the data's actions are known to be in other units than the task's Box.
 
-    :param dataset: a TrajectoryDataset; trajectories of the Box's width count, and if a robot is
-        named, only its own and unnamed ones
+    :param dataset: a TrajectoryDataset, of which only trajectories with actions as wide as the Box
+        count
+    :param box: the task's action space
+    :param embodiment: a robot's name; if there is one, only its trajectories and those without a
+        name count
     """
     width = box.shape[0]
     different: dict[tuple[tuple[float, ...], ...], int] = {}
@@ -161,7 +165,7 @@ def _unknown(trajectory: Trajectory, box: spaces.Box) -> bool:
 
 
 def _dimensions_of_box(trajectories: Sequence[Trajectory], box: spaces.Box) -> np.ndarray:
-    """(A,) bool, the dimensions whose actions were stored in the Box's own units."""
+    """Return which dimensions of actions were stored in the Box's own units, (A,) bool."""
     if sum(len(t) for t in trajectories) < ENOUGH:
         return np.zeros(box.shape[0], bool)
     action = np.concatenate([t.action[:, : t.action_dim] for t in trajectories])

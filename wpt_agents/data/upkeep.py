@@ -1,4 +1,4 @@
-"""What is done to a dataset as a whole: describe it, and find what is damaged."""
+"""Operations on a whole dataset: describe it, and find damaged trajectories."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -18,14 +18,15 @@ class Damage(NamedTuple):
 
 
 def count_set_aside(folders: Sequence[Folder]) -> int:
-    """The number of trajectories that `validate(set_aside=True)` has left out."""
+    """Return the number of trajectories that `validate(set_aside=True)` has left out."""
     return sum(len(read_damaged(folder.path)) for folder in folders)
 
 
 def describe(folders: Sequence[Folder], entries: Sequence[Entry]) -> dict[str, Any]:
     """Count trajectories, widths, lengths and the bytes that an image takes.
 
-    `compression` is the ratio of the images' own size to what is stored, actions included.
+    `compression` is the ratio of the raw size of the images to the stored size, which includes
+    actions and rewards.
     """
     stored = sum(sum(entry.sizes) for entry in entries)
     lengths = [entry.length for entry in entries]
@@ -58,8 +59,9 @@ def find_damage(
 ) -> list[Damage]:
     """Read trajectories 0 .. `count - 1` and list the damaged ones.
 
-    :param check: reads a trajectory; what is wrong with it, or None
-    :param apply: `map`, or a thread pool's
+    :param check: reads a trajectory by its number and returns what is wrong with it, or None
+    :param count: the number of trajectories
+    :param apply: `map`, or that of a thread pool
     """
     damaged = []
     with StageBar(count, "validate", progress_bar) as bar:

@@ -32,7 +32,7 @@ class Windows:
         self._ends = (0, self._images)
 
     def draw(self, batch_size: int, length: int, rng: np.random.Generator) -> list[Row]:
-        """Draw the pieces of `batch_size` sequences; several each if trajectories are short."""
+        """Draw the pieces of `batch_size` sequences; a sequence has several if they are short."""
         known, ends = self._ends
         if known != length:
             # a short trajectory counts as one window
@@ -48,7 +48,7 @@ class Windows:
         ]
 
     def _chain(self, i: int, start: int, length: int, rng: np.random.Generator) -> Row:
-        """Return the piece from `start` on, and whole trajectories behind it until it is long."""
+        """Return the piece from `start` on, and further trajectories up to `length` images."""
         pieces = []
         while True:
             stop = int(min(start + length, self._images[i]))
@@ -70,11 +70,13 @@ def make_batch(
 ) -> Batch:
     """Copy the pieces of each row, one after the other, into a new Batch.
 
-    :param read: where a piece is: a trajectory, or a part of one, and the images to take of it
+    :param read: reads a piece: returns a trajectory, or a part of one, and the first and the last +
+        1 of its images to take
     :param image_shape: (H, W, 3)
     :param width: the agent's action width, `max_action_dim`
-    :param apply: `map`, or a thread pool's if `read` takes time
-    :param background: of a trajectory's number, (H, W, 3) uint8; with it, a `MarkedBatch` is made
+    :param apply: `map`, or that of a thread pool if `read` takes time
+    :param background: returns the background of a trajectory by its number, (H, W, 3) uint8; with
+        it, a `MarkedBatch` is made
     :raises ValueError: a trajectory with more actions than `width`
     """
     length = sum(stop - start for _, start, stop in rows[0])

@@ -10,7 +10,8 @@ from gymnasium import spaces
 def to_bounds(action: np.ndarray, space: spaces.Box) -> np.ndarray:
     """Map [-1, 1] onto the bounds of a Box; whole numbers are rounded.
 
-    :param action: (n, A), A being at least the width of the Box; further entries are padding
+    :param action: (n, A) in [-1, 1], where A is at least the width of the Box; further entries are
+        padding
     :return: (n, width) of the dtype of the Box
     """
     low, high = space.low, space.high
@@ -25,12 +26,12 @@ def to_bounds(action: np.ndarray, space: spaces.Box) -> np.ndarray:
 
 
 def space_as_dict(space: spaces.Box) -> dict[str, Any]:
-    """Return the bounds and the dtype of a Box as a model file holds them."""
+    """Return the bounds and the dtype of a Box in the form in which a model file stores them."""
     return {"low": space.low.tolist(), "high": space.high.tolist(), "dtype": space.dtype.name}
 
 
 def space_from_dict(fields: Mapping[str, Any]) -> spaces.Box:
-    """Make the Box that `space_as_dict` described; files of version 0.1 hold no dtype."""
+    """Make the Box that `space_as_dict` described; files of version 0.1 lack the dtype."""
     dtype = np.dtype(fields.get("dtype", "float32"))
     low, high = np.array(fields["low"], dtype), np.array(fields["high"], dtype)
     return spaces.Box(low, high, dtype=dtype.type)

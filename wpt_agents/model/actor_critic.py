@@ -49,15 +49,19 @@ def lambda_return(
 def draw_starts(
     batch_size: int, length: int, number: int, generator: Generator | None, device: torch.device
 ) -> Tensor:
-    """Return which of the B x T replayed states dreams start from.
+    """Draw the states, of the B x T replayed ones, from which imagination starts.
 
-    Algorithm 1 starts from all of them, and `number` 0 does so here. Gradients differ little from
-    start to start, so a random subset teaches about as much at a fraction of the cost. Every row
-    contributes the same number of states (to within one), which keeps the share of retrieved rows.
-    States that have seen fewer than three images are left out, because they know little. This is a
-    deviation from the paper, by the sizes that set `Size.imagine_starts`.
+    Algorithm 1 starts from all of them, as 0 for `number` does here. A subset is a deviation from
+    the paper, in the sizes that set `Size.imagine_starts`: gradients of different states are
+    similar, so a random subset teaches about as much at a fraction of the cost. Every row
+    contributes the same number of states (to within one), so that the share of retrieved rows is
+    kept. The states of a row's first two images are left out, because they contain little
+    information.
 
-    :param number: how many, drawn without replacement; at most those with three images behind them
+    :param batch_size: B
+    :param length: T
+    :param number: N, the number of states to draw without replacement, or all but those of the
+        first two images if there are fewer; 0 for all
     :return: (N,) indices into the flattened states, sorted
     """
     blind = CONTEXT - 1 if length >= CONTEXT else 0
@@ -82,11 +86,12 @@ def critic_loss(
 ) -> Tensor:
     """Eq. (3): -ln v(V_t | s_t), averaged, step t weighing γ^t.
 
-    :param logits: (B, H, bins), of detached states
+    :param logits: (B, H, bins), the critic's outputs on detached states
     :param lambda_return: (B, H); no gradient reaches it
     :param gamma: γ of the weights
-    :param goes_on: (B, H), c of `lambda_return`: steps that dreams hardly reach weigh less
-    :param bin_range: of the bins, in symlog space
+    :param goes_on: (B, H), c of `lambda_return`: steps that an episode hardly reaches weigh less
+    :param bin_range: largest bin, in symlog space
+    :return: scalar
     """
     assert logits.shape[:2] == lambda_return.shape, (logits.shape, lambda_return.shape)
     weight = discounts(lambda_return.shape[1], gamma, like=lambda_return)
@@ -104,15 +109,17 @@ def actor_loss(
 ) -> Tensor:
     """Eq. (4): -V_t - η H[a_t | s_t], averaged, step t weighing γ^t.
 
-    V_0 contains the reward of the starting state, which no imagined action caused. So the actions
-    of the steps 0 .. H-2 are judged by the returns of the steps 1 .. H-1.
+    V_0 contains the reward of the starting state, which no imagined action caused. So the loss
+    pairs the actions of the steps 0 .. H-2 with the returns of the steps 1 .. H-1.
 
     :param lambda_return: (B, H), with its gradient through the dynamics
     :param entropy: (B, H), of the actor at the steps 0 .. H-1
-    :param ent_coef: η, the weight of the entropy in nats
+    :param ent_coef: η, the weight of the entropy, which is in nats
     :param gamma: γ of the weights
     :param return_scale: divides the returns; 1 in the paper
-    :param goes_on: (B, H), c of `lambda_return`: an action counts if the episode goes on after it
+    :param goes_on: (B, H), c of `lambda_return`: an action weighs as much as the episode is likely
+        to continue after it
+    :return: scalar
     """
     assert lambda_return.shape == entropy.shape, (lambda_return.shape, entropy.shape)
     weight = actor_weight(gamma, entropy, goes_on)
@@ -123,12 +130,12 @@ def actor_loss(
 
 
 def discounts(length: int, gamma: float, like: Tensor) -> Tensor:
-    """1, γ, γ², ...: (length,)."""
+    """Return the weights 1, γ, γ², ...: (length,), with the device and dtype of `like`."""
     return gamma ** torch.arange(length, device=like.device, dtype=torch.float32)
 
 
 def survival(goes_on: Tensor) -> Tensor:
-    """Π_{k<t} c_k: the probability that a dream has not ended before step t.
+    """Return Π_{k<t} c_k: the probability that the episode has not ended before step t.
 
     :param goes_on: (B, H), c of the steps 0 .. H-1; no gradient reaches it
     :return: (B, H), 1 at step 0
@@ -140,9 +147,10 @@ def survival(goes_on: Tensor) -> Tensor:
 def actor_weight(gamma: float, like: Tensor, goes_on: Tensor | None = None) -> Tensor:
     """Return the weights of the actions at the steps 0 .. H-2: γ^t Π_{k<=t} c_k.
 
-    An action at a step that ends the episode leads nowhere, so c_t is a factor of its own weight.
+    An action at a step that ends the episode has no consequences, so its weight contains c_t.
 
-    :param like: (B, H), for device and length
+    :param gamma: γ
+    :param like: (B, H), a tensor with the device, dtype and length H to use
     :param goes_on: (B, H), c; 1 everywhere if None
     :return: (H - 1,) or (B, H - 1)
     """
@@ -154,6 +162,8 @@ def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -
     """Return the range between two quantiles of the returns, by which DreamerV3 divides them.
 
     :param lambda_return: (B, H); no gradient reaches it
+    :param low: the lower quantile
+    :param high: the upper quantile
     :return: scalar
     """
     quantiles = torch.quantile(
@@ -165,18 +175,19 @@ def return_range(lambda_return: Tensor, low: float = 0.05, high: float = 0.95) -
 
 @torch.no_grad()
 def ema_update(target: nn.Module, source: nn.Module, fraction: float = 0.02) -> None:
-    """Move `target` towards `source` by `fraction`: t + fraction (s - t)."""
+    """Move each weight t of `target` to t + fraction (s - t), where s is that of `source`."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), fraction)
 
 
 def debiased_fraction(fraction: float, n: int) -> float:
-    """Return by how much the average of n values moves to the n-th, f / (1 - (1 - f)^n).
+    """Return the share by which an average moves to its n-th value, f / (1 - (1 - f)^n).
 
     The k-th of n values then weighs (1 - f)^(n - k), divided by the sum of these weights: an
     exponential average without the value that it began with. Source: Algorithm 1 of
     https://arxiv.org/abs/1412.6980
 
-    :param n: 1 for the first value, which replaces whatever was there
+    :param fraction: f, the share for large n
+    :param n: the number of the value; the first one, with n = 1, replaces the average
     """
     return fraction / (1 - (1 - fraction) ** n)
 
@@ -199,7 +210,7 @@ class Actor(Head):
         """Return the action distribution.
 
         :param feat: (..., D + S*K)
-        :param mask: (A,) bool, True at the embodiment's own entries
+        :param mask: (A,) bool, False in the padding
         """
         return self.truncated(self(feat), mask)
 
@@ -227,7 +238,7 @@ class Critic(Head):
 
     :param size: the widths
     :param zero_init: start with the value 0 everywhere
-    :param bin_range: of the bins, in symlog space
+    :param bin_range: largest bin, in symlog space
     """
 
     def __init__(self, size: Size, zero_init: bool = False, bin_range: float = BIN_RANGE) -> None:

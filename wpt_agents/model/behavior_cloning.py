@@ -20,12 +20,14 @@ BC_VARIANCES = ("fixed", "trajectory")
 def bc_loss(
     prediction: Tensor, action: Tensor, mask: Tensor, weight: Tensor | None = None
 ) -> Tensor:
-    """-log π_bc(a | o) of a Gaussian, up to constants: the squared error, over the variance.
+    """Return -log π_bc(a | o) of a Gaussian up to constants: the mean squared error.
 
     :param prediction: (N, A), the Gaussian's mean
     :param action: (N, A), taken at the observation
-    :param mask: (A,) bool, True at the embodiment's own entries; the others do not count
-    :param weight: (N,), proportional to one over the variance; None for a fixed variance
+    :param mask: (A,) bool, False in the padding, which does not count
+    :param weight: (N,), factors of the squared errors, proportional to one over the variance; None
+        for a fixed variance
+    :return: scalar
     """
     assert prediction.shape == action.shape, (prediction.shape, action.shape)
     squares = (prediction - action).square() * mask
@@ -35,13 +37,12 @@ def bc_loss(
 
 
 class TrajectoryVariances:
-    """σ_i²: how far the actions of each trajectory are from the prior actor's, on average.
+    """The variance σ_i² of the actions of each trajectory i around the prior actor's.
 
-    Running estimates of the maximum of the likelihood, if the actions of trajectory i are Gaussian
+    They are running maximum-likelihood estimates, if the actions of trajectory i are Gaussian
     around the prior actor's with a variance of their own. The squared errors of a trajectory then
     count in proportion to 1 / σ_i², so that a noisy demonstrator has less influence. Not in the
-    paper.
-    Source of the idea, for discrete actions: https://arxiv.org/abs/2202.01288
+    paper. Source of the idea, for discrete actions: https://arxiv.org/abs/2202.01288
 
     :param n: number of trajectories
     """
@@ -53,7 +54,13 @@ class TrajectoryVariances:
         self.values = torch.ones(n, device=device)
 
     def update(self, prediction: Tensor, action: Tensor, mask: Tensor, chosen: Tensor) -> None:
-        """Let the variances follow the errors of a batch, (N, A), drawn from `chosen`, (N,)."""
+        """Update the variances with the errors of a batch.
+
+        :param prediction: (N, A), the prior actor's actions
+        :param action: (N, A), the recorded ones
+        :param mask: (A,) bool, False in the padding
+        :param chosen: (N,), the index of the trajectory that each row is of
+        """
         error = ((prediction.detach() - action).square() * mask).sum(1) / mask.sum()
         drawn = one_hot(chosen, len(self.values)).to(error.dtype)  # a sum in a fixed order
         number = drawn.sum(0)
@@ -69,7 +76,7 @@ class TrajectoryVariances:
 def draw_pairs(
     trajectories: Sequence[Trajectory], n: int, action_dim: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw n steps of all trajectories: the images seen, and the action that was then taken.
+    """Draw n steps of all trajectories: the last images, and the action that was then taken.
 
     Before an episode's third image, its first image takes the place of the missing ones, as in
     acting.
@@ -93,10 +100,12 @@ def draw_pairs(
 def random_shift(image: Tensor, pad: int, generator: Generator | None = None) -> Tensor:
     """Shift each stack of frames by up to `pad` pixels, repeating the border.
 
-    The paper does not say how far; 3 pixels are the authors', DrQ-v2 has 4 of 84. Smaller shifts
-    preserve more of where things are (docs/experiments.md).
+    The paper does not state the largest shift. The authors' code has 3 pixels, and DrQ-v2 has 4 at
+    84 x 84 pixels. With smaller shifts, the positions of objects are more precise
+    (docs/experiments.md).
 
     :param image: (N, F, H, W, C)
+    :return: (N, F, H, W, C), the frames of one stack shifted alike
     """
     shape = len(image), 2
     shift = torch.randint(-pad, pad + 1, shape, device=image.device, generator=generator)
@@ -105,7 +114,7 @@ def random_shift(image: Tensor, pad: int, generator: Generator | None = None) ->
 
 @op
 def shifted(image: Tensor, shift: Tensor, pad: int) -> Tensor:
-    """Let pixel (i, j) of each stack be its former pixel (i + y, j + x), or the border's nearest.
+    """Replace pixel (i, j) of each stack by its pixel (i + y, j + x), or the nearest one there is.
 
     :param image: (N, F, H, W, C)
     :param shift: (N, 2) int, y and x of each stack
@@ -153,13 +162,13 @@ class PriorActor(nn.Module):
         )
 
     def forward(self, image: Tensor) -> Tensor:
-        """(N, F, 64, 64, 3) uint8, oldest first -> (N, A), not clipped."""
+        """Return actions without clipping: (N, F, 64, 64, 3) uint8, oldest first -> (N, A)."""
         stacked = image.permute(0, 2, 3, 1, 4).flatten(-2)
         action: Tensor = self.layers(self.encoder(stacked))
         return action
 
     def act(self, image: Tensor, mask: Tensor) -> Tensor:
-        """(N, F, 64, 64, 3) uint8 -> (N, A) in [-1, 1], zero in the padding."""
+        """Return actions in [-1, 1], 0 in the padding: (N, F, 64, 64, 3) uint8 -> (N, A)."""
         action: Tensor = self(image)
         # Clipped only here: a loss on clipped actions has no gradient beyond the limits.
         return action.clamp(-1, 1) * mask

@@ -1,8 +1,9 @@
 """How actor and prior actor act together: by the value of their actions, or by their sum.
 
-The choice is that of imitation-bootstrapped RL (IBRL, https://arxiv.org/abs/2311.02198). IBRL asks
-a Q-function; here the world model imagines the step. Values include the reward on arriving (Eq. 2),
-so an action is worth γ v(s') of the state s' it leads to, and γ is the same for both.
+The choice is that of imitation-bootstrapped RL (IBRL, https://arxiv.org/abs/2311.02198). IBRL
+compares the two actions by a Q-function; here the world model imagines the next state s' of each.
+Values include the reward for arriving in a state (Eq. 2), so the value of an action is γ v(s'). As
+γ is the same for both actions, v(s') is compared.
 """
 
 from typing import Protocol
@@ -18,7 +19,7 @@ from wpt_agents.model.world_model import WorldModel
 
 
 class Chooser(Protocol):
-    """A policy with all that takes part in the choice."""
+    """A policy with the networks that take part in the choice."""
 
     world_model: WorldModel
     target_critic: Critic
@@ -33,12 +34,13 @@ class Chooser(Protocol):
 def choose_by_value(
     action: Tensor, proposal: Tensor, value: Tensor, proposed_value: Tensor
 ) -> Tensor:
-    """Take `proposal` where it is worth more than `action`.
+    """Return `proposal` where its value is larger, and `action` elsewhere.
 
     :param action: (N, A)
     :param proposal: (N, A)
     :param value: (N,), of `action`
     :param proposed_value: (N,), of `proposal`
+    :return: (N, A)
     """
     assert action.shape == proposal.shape, (action.shape, proposal.shape)
     assert value.shape == proposed_value.shape == action.shape[:1], (value.shape, action.shape)
@@ -59,11 +61,12 @@ def value_of_action(rssm: RSSM, critic: Critic, state: Latent, action: Tensor) -
 
 
 def actor_or_prior(policy: Chooser, state: Latent, action: Tensor, frames: Tensor) -> Tensor:
-    """Return the actor's action, or the prior actor's where the target critic prefers it.
+    """Return the actor's action, or the prior actor's where the target critic's value is larger.
 
     :param state: (N, ...), where to act
     :param action: (N, A), the actor's
     :param frames: (N, F, 64, 64, 3) uint8, what the prior actor sees
+    :return: (N, A)
     """
     proposal = policy.prior_actor.act(frames, policy.action_mask)
     rssm = policy.world_model.rssm
@@ -76,10 +79,11 @@ def corrected(
 ) -> TruncatedNormal:
     """Return the actor's distribution around the prior actor's action, not its imitation of it.
 
-    The mean is the prior actor's action plus what imagination has changed: the difference between
-    the actor and an imitator of the prior actor. Where these agree, as before imagination, the
-    prior actor acts, and not an imitation from latent states, which lack details of the images.
-    Source of learning corrections to a policy: https://arxiv.org/abs/1812.06298
+    The mean is the prior actor's action plus what learning in imagination has changed: the
+    difference between the actor and an imitator of the prior actor. Where actor and imitator agree,
+    as before learning in imagination, the prior actor itself acts, and not its imitation from
+    latent states, which lack details of the images. Source of learning corrections to a policy:
+    https://arxiv.org/abs/1812.06298
 
     :param dist: the actor's, (N, A)
     :param state: (N, ...), where to act

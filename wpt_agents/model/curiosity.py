@@ -11,7 +11,7 @@ MEMBERS = 5  # of the ensemble, as in Plan2Explore
 
 
 class Scale(nn.Module):
-    """Divide by a running mean, so that a reward is about 1 while surprise becomes smaller."""
+    """Divide by a running mean, so that rewards stay near 1 while the surprise decreases."""
 
     mean: Tensor
     weight: Tensor
@@ -29,12 +29,12 @@ class Scale(nn.Module):
         self.weight.mul_(self.keep).add_(1 - self.keep)
 
     def forward(self, surprise: Tensor) -> Tensor:
-        """(...) -> (...)."""
+        """Return the scaled surprise: (...) -> (...)."""
         return surprise * (self.weight / self.mean.clamp_min(1e-8))  # all surprises may be 0
 
 
 class ICM(nn.Module):
-    """Features from which an inverse model reads the action, and a forward model of them.
+    """The intrinsic curiosity module: features, their forward model, and an inverse model.
 
     :param size: the widths
     :param action_dim: the padded action width, A
@@ -77,19 +77,21 @@ class ICM(nn.Module):
 
 
 def forward_error(predicted: Tensor, features: Tensor) -> Tensor:
-    """Pathak et al. (5), ½ ||φ^(o') - φ(o')||², and by (6) the curiosity: (..., F) -> (...)."""
+    """Pathak et al. (5) and (6), the curiosity: ½ ||φ^(o') - φ(o')||², (..., F) -> (...)."""
     return 0.5 * (predicted - features).square().sum(-1)
 
 
 def icm_loss(
     read: Tensor, action: Tensor, surprise: Tensor, within: Tensor, forward_share: float = 0.2
 ) -> Tensor:
-    """Pathak et al. (7) without its policy: (1 - β) inverse loss + β forward loss.
+    """Pathak et al. (7) without its policy term: (1 - β) inverse loss + β forward loss.
 
     :param read: (..., A), the inverse model's actions; continuous, so their error is squared
     :param action: (..., A)
     :param surprise: (...), the `forward_error`
     :param within: (...) bool, False where the two images are of different episodes
+    :param forward_share: β
+    :return: scalar
     """
     assert read.shape == action.shape and surprise.shape == within.shape, (read.shape, within.shape)
     inverse = (read - action).square().sum(-1)
@@ -102,7 +104,8 @@ class Ensemble(nn.Module):
 
     :param size: the widths
     :param action_dim: the padded action width, A
-    :param outputs: width of what they predict, the encoded next image
+    :param outputs: width of the prediction, the encoded next image
+    :param members: number of models
     """
 
     def __init__(self, size: Size, action_dim: int, outputs: int, members: int = MEMBERS) -> None:
@@ -125,11 +128,12 @@ class Ensemble(nn.Module):
 
 
 def ensemble_loss(prediction: Tensor, target: Tensor, within: Tensor) -> Tensor:
-    """-log of Gaussians of fixed variance, up to constants, averaged over the members.
+    """Return -log p of Gaussians of fixed variance, up to constants, averaged over the members.
 
     :param prediction: (members, ..., E)
     :param target: (..., E); no gradient reaches it
     :param within: (...) bool, False where the target is of another episode
+    :return: scalar
     """
     error = (prediction - target.detach()).square().mean(-1)
     return (error * within).sum() / (len(prediction) * within.sum()).clamp_min(1)

@@ -12,7 +12,7 @@ SQRT2 = math.sqrt(2.0)
 
 
 class Share(Generator):
-    """A generator for some rows of a batch: each row gets the numbers it gets in the whole batch.
+    """A generator for a part of a batch: each row gets the numbers of its place in the whole batch.
 
     :param rows: number of rows of the whole batch
     :param first: the number, in the whole batch, of the first row here
@@ -43,7 +43,7 @@ Noise = Generator | Drawn | None
 
 
 def uniform(like: Tensor, generator: Noise = None) -> Tensor:
-    """Draw from [0, 1) in the shape of `like`."""
+    """Draw uniformly from [0, 1) in the shape of `like`."""
     if isinstance(generator, Drawn):
         return generator.next()
     return torch.rand(like.shape, device=like.device, generator=generator)
@@ -87,7 +87,7 @@ def two_hot(x: Tensor, bins: int = BINS, bin_range: float = BIN_RANGE) -> Tensor
 
 
 def two_hot_mean(logits: Tensor, bin_range: float = BIN_RANGE) -> Tensor:
-    """Symexp of the mean bin: (..., bins) logits -> (...)."""
+    """Return symexp of the mean bin: (..., bins) logits -> (...)."""
     logits = logits.float()
     bins = torch.linspace(-bin_range, bin_range, logits.shape[-1], device=logits.device)
     # As in DreamerV3's first version; the later one averages symexp-spaced bins instead.
@@ -95,7 +95,7 @@ def two_hot_mean(logits: Tensor, bin_range: float = BIN_RANGE) -> Tensor:
 
 
 def two_hot_loss(logits: Tensor, target: Tensor, bin_range: float = BIN_RANGE) -> Tensor:
-    """-ln p(target): cross entropy with the two-hot target.
+    """Return -ln p(target), the cross entropy with the two-hot target.
 
     :param logits: (..., bins)
     :param target: (...), before symlog
@@ -109,6 +109,8 @@ def unimix_logits(logits: Tensor, unimix: float = 0.01) -> Tensor:
     """Log-probabilities of (1 - unimix) softmax + unimix / K: no class has probability zero.
 
     :param logits: (..., K)
+    :param unimix: share of the uniform distribution
+    :return: (..., K)
     """
     probs = logits.float().softmax(-1)
     return torch.log((1 - unimix) * probs + unimix / logits.shape[-1])
@@ -137,7 +139,7 @@ def _straight_through(probs: Tensor, index: Tensor) -> Tensor:
 
 
 def kl_one_hot(left: Tensor, right: Tensor) -> Tensor:
-    """KL(left || right), summed over the groups.
+    """Return KL(left || right) in nats, summed over the groups.
 
     :param left: (..., S, K) log-probabilities
     :param right: (..., S, K) log-probabilities
@@ -168,7 +170,7 @@ class TruncatedNormal:
 
     @property
     def mode(self) -> Tensor:
-        """(..., A): the mean of the normal before truncation, which lies in [-1, 1]."""
+        """The mean of the normal before truncation, which lies in [-1, 1]: (..., A)."""
         return self.mean * self.mask
 
     def rsample(self, generator: Noise = None) -> Tensor:
@@ -179,13 +181,13 @@ class TruncatedNormal:
         return (self.mean + self.std * z).clamp(-1, 1) * self.mask
 
     def log_prob(self, action: Tensor) -> Tensor:
-        """(..., A) -> (...), summed over the entries that are not padded."""
+        """Return ln p(action), summed over the entries that are not padded: (..., A) -> (...)."""
         z = (action - self.mean) / self.std
         log_prob = -0.5 * z * z - self.std.log() - 0.5 * math.log(2 * math.pi) - self.mass.log()
         return (log_prob * self.mask).sum(-1)
 
     def entropy(self) -> Tensor:
-        """(...): the exact entropy, summed over the entries that are not padded.
+        """Return the exact entropy in nats, summed over the entries that are not padded: (...).
 
         With α and β the standardised bounds and Z the mass between them, it is
         ln(sqrt(2πe) s Z) + (α φ(α) - β φ(β)) / (2 Z).

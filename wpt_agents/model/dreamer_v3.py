@@ -2,10 +2,10 @@
 
 Each is behind a keyword of WPT that is off by default: `actor_grad="reinforce"`, `repval_scale`,
 `slow_critic_scale` (the critic's loss once more, with the target critic's values as targets), and
-the continue head, which is used where the data hold a termination.
+the continue head, which is used once an episode of the task has terminated.
 
-Our rewards come with arriving in a state: V_t contains r_t, which the action at step t did not
-cause. The return of that action is therefore γ V_{t+1}, and its baseline v_t - r_t.
+Here, rewards belong to the state in which a step arrives: V_t contains r_t, which the action at
+step t did not cause. The return of that action is therefore γ V_{t+1}, and its baseline v_t - r_t.
 """
 
 import torch
@@ -24,7 +24,7 @@ def advantage(
     :param value: (N, H + 1), the critic's means at the steps 0 .. H
     :param lambda_return: (N, H), V of Eq. (2)
     :param discount: γ, or (N, H) γ times the probability that the episode goes on after step t
-    :return: (N, H - 1), of the actions at the steps 0 .. H-2; no gradient runs through it
+    :return: (N, H - 1), of the actions at the steps 0 .. H-2, without gradient
     """
     if isinstance(discount, Tensor):
         discount = discount[:, :-1]
@@ -42,11 +42,13 @@ def reinforce_loss(
 ) -> Tensor:
     """DreamerV3's Eq. (11): -A_t / S ln π(a_t | s_t) - η H[a_t | s_t], step t weighing γ^t.
 
-    :param log_prob: (N, H - 1), of the actions taken, as constants
+    :param log_prob: (N, H - 1), of the actions that were taken, which are constants
     :param advantage: (N, H - 1)
-    :param entropy: (N, H - 1)
+    :param entropy: (N, H - 1), of the actor
     :param weight: (H - 1,) or (N, H - 1), γ^t, or γ^t Π_{k<t} c_k where episodes may end
-    :param return_scale: S, what returns are divided by
+    :param ent_coef: η, the weight of the entropy, which is in nats
+    :param return_scale: S, by which returns are divided
+    :return: scalar
     """
     assert log_prob.shape == advantage.shape == entropy.shape, (log_prob.shape, entropy.shape)
     objective = log_prob * (advantage / return_scale) + ent_coef * entropy
@@ -65,8 +67,8 @@ def replay_return(
 
     :param reward: (B, T), on arriving in each replayed state
     :param value: (B, T), the critic's mean in each replayed state
-    :param is_last: (B, T) bool, the next state belongs to another episode
-    :param is_terminal: (B, T) bool, the episode ended here and nothing follows
+    :param is_last: (B, T) bool, whether the next state belongs to another episode
+    :param is_terminal: (B, T) bool, whether the state is terminal
     :return: (B, T); at the last step of a sequence or an episode it is the critic's value
     """
     assert reward.shape == value.shape == is_last.shape == is_terminal.shape, reward.shape
@@ -86,21 +88,23 @@ def replay_value_loss(
 
     It trains the critic on returns that were earned, since imagined returns may be too high.
 
-    :param logits: (B, T, bins) of the critic on detached replayed states
+    :param logits: (B, T, bins), the critic's outputs on detached replayed states
     :param replay_return: (B, T); no gradient reaches it
-    :param known: (B, T) bool
-    :param bin_range: of the bins, in symlog space
+    :param known: (B, T) bool, where the rewards are known
+    :param bin_range: largest bin, in symlog space
+    :return: scalar
     """
     loss = two_hot_loss(logits, replay_return.detach(), bin_range)
     return (loss * known).sum() / known.sum().clamp_min(1)
 
 
 def continue_loss(logits: Tensor, is_terminal: Tensor, known: Tensor) -> Tensor:
-    """-ln p(c_t | s_t) of a Bernoulli: whether the episode goes on after this state.
+    """Return -ln p(c_t | s_t) of a Bernoulli: whether the episode continues after a state.
 
-    :param logits: (B, T), of going on, on detached features
-    :param is_terminal: (B, T) bool
-    :param known: (B, T) bool, the steps of the task; other tasks may end elsewhere
+    :param logits: (B, T), the log-odds of continuing, on detached features
+    :param is_terminal: (B, T) bool, whether the state is terminal
+    :param known: (B, T) bool, True at steps of the task, since other tasks may end elsewhere
+    :return: scalar
     """
     goes_on = (~is_terminal).float()
     loss = F.binary_cross_entropy_with_logits(logits.float(), goes_on, reduction="none")

@@ -1,4 +1,4 @@
-"""Ensembles computed in one product: RLPD's critics and ExPLORe's reward heads."""
+"""Ensembles whose members are computed together: RLPD's critics and ExPLORe's reward heads."""
 
 import torch
 import torch.nn.functional as F
@@ -36,7 +36,7 @@ class EnsembleNorm(nn.Module):
 
 
 class CriticEnsemble(nn.Module):
-    """Q_1 .. Q_K on a common trunk, with layer norm in front of each ReLU.
+    """The value functions Q_1 .. Q_K on a common trunk, with layer norm before each ReLU.
 
     :param embed_dim: E, the width of the encoder's output
     :param features: width of the trunk's latent z
@@ -62,14 +62,14 @@ class CriticEnsemble(nn.Module):
         )
 
     def forward(self, embed: Tensor, action: Tensor) -> Tensor:
-        """(N, E), (N, A) -> (K, N)."""
+        """Return the values by all members: (N, E), (N, A) -> (K, N)."""
         inputs = torch.cat([self.trunk(embed), action], -1)
         values: Tensor = self.layers(inputs.expand(self.members, -1, -1))
         return values.squeeze(-1)
 
 
 class RewardEnsemble(nn.Module):
-    """r_1(z) .. r_K(z), which differ in their initial weights and in the rows that they learn from.
+    """Reward heads r_1(z) .. r_K(z), which differ in initial weights and in their training rows.
 
     :param features: width of z, the critics' latent
     :param hidden: width of the two hidden layers
@@ -88,6 +88,6 @@ class RewardEnsemble(nn.Module):
         )
 
     def forward(self, latent: Tensor) -> Tensor:
-        """(N, Z) -> (K, N)."""
+        """Return the rewards by all members: (N, Z) -> (K, N)."""
         rewards: Tensor = self.layers(latent.expand(self.members, -1, -1))
         return rewards.squeeze(-1)

@@ -16,15 +16,15 @@ from wpt_agents.model.sizes import Size
 
 
 class FramePolicy(PixelPolicy):
-    """Acts on the last three images. Subclasses say which networks there are and how they decide.
+    """A policy that acts on the last three images; subclasses define the networks.
 
-    The networks are as wide as the environment's own actions. They are drawn again whenever
+    The networks are as wide as the environment's own actions. They are initialised again whenever
     `set_action_space` is called with another width.
 
-    :param observation_space: the environment's; images are converted at the border
+    :param observation_space: the environment's; images are converted in `predict`
     :param action_space: a Box
     :param clone_size: the widths of the prior actor, or None for no prior actor
-    :param widths: what `build` makes the networks of, by the names of the agent's keywords
+    :param widths: the keywords of the agent that `build` uses
     """
 
     action_mask: Tensor  # (A,) bool, all True: nothing is padded
@@ -48,7 +48,7 @@ class FramePolicy(PixelPolicy):
         return self.action_space.shape[0]
 
     def reset_behavior(self) -> None:
-        """Draw new weights for all networks, which belong to a task."""
+        """Initialise all networks again, as they belong to a task."""
         device = self.device
         mask = torch.ones(self.action_dim, dtype=torch.bool)
         self.register_buffer("action_mask", mask, persistent=False)
@@ -93,7 +93,7 @@ class FramePolicy(PixelPolicy):
         :param state: from the step before, or None
         :param episode_start: (n,) bool, where the state is reset
         :param deterministic: act without noise
-        :param generator: of the noise; torch's own if None
+        :param generator: source of the noise; torch's own if None
         :return: action (n, A) in [-1, 1], and the new state
         """
         if state is not None:
@@ -101,11 +101,13 @@ class FramePolicy(PixelPolicy):
         frames = stack_frames(image, None if state is None else state[0], episode_start)
         action = self.decide(torch.from_numpy(frames).to(self.device), deterministic, generator)
         if not action.isfinite().all():
-            raise ValueError("The actor's output is not finite: the weights are damaged")
+            raise ValueError(
+                "The actor's output is not finite: the weights are damaged, load an earlier model"
+            )
         return action.cpu().numpy(), (frames,)
 
     def executed(self, state: State, action: np.ndarray) -> State:
-        """Return the state after `action` was executed, which it does not depend on."""
+        """Return the state after `action` was executed; it does not depend on the action."""
         return state
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

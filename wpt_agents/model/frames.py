@@ -13,10 +13,10 @@ from wpt_agents.model.behavior_cloning import FRAMES
 class FrameEncoder(nn.Module):
     """3x3 convolutions without padding, each followed by ReLU, over frames stacked as channels.
 
-    :param channels: of each layer
-    :param strides: of each layer
+    :param channels: number of channels of each layer
+    :param strides: stride of each layer
     :param frames: F, the number of frames that are stacked
-    :param centre: subtracted from the pixels, which are divided by 255 before
+    :param centre: number that is subtracted from the pixels after their division by 255
     :param differences: if above 0, all frames but the newest are replaced by the differences of
         neighbours times this number, so that small movements are large inputs
     :ivar embed_dim: E, the width of the output
@@ -45,7 +45,7 @@ class FrameEncoder(nn.Module):
         self.embed_dim = channels[-1] * side**2
 
     def forward(self, image: Tensor) -> Tensor:
-        """(N, F, 64, 64, 3) uint8, oldest first -> (N, E)."""
+        """Encode stacks of frames, oldest first: (N, F, 64, 64, 3) uint8 -> (N, E)."""
         x = image.permute(0, 1, 4, 2, 3).float() / 255 - self.centre
         if self.differences:
             x = torch.cat([self.differences * x.diff(dim=1), x[:, -1:]], 1)
@@ -56,7 +56,7 @@ class FrameEncoder(nn.Module):
 
 
 class Trunk(nn.Sequential):
-    """From the encoder to a small latent z = tanh(LayerNorm(W e + b)): (N, E) -> (N, Z).
+    """Map the encoder's output e to z = tanh(LayerNorm(W e + b)): (N, E) -> (N, Z).
 
     :param embed_dim: E
     :param features: Z
@@ -67,7 +67,7 @@ class Trunk(nn.Sequential):
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Two hidden layers with ReLU: (N, inputs) -> (N, outputs)."""
+    """Make an MLP of two hidden layers with ReLU: (N, inputs) -> (N, outputs)."""
     return nn.Sequential(
         nn.Linear(inputs, hidden),
         nn.ReLU(),
@@ -78,7 +78,7 @@ def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 def orthogonal(module: nn.Module) -> None:
-    """DrQ-v2's initial weights: orthogonal, with gain sqrt 2 in convolutions, and zero biases.
+    """Set DrQ-v2's initial weights: orthogonal, gain sqrt 2 in convolutions, zero biases.
 
     Apply it with `network.apply(orthogonal)`.
     """
@@ -90,7 +90,7 @@ def orthogonal(module: nn.Module) -> None:
 
 
 def xavier(module: nn.Module) -> None:
-    """RLPD's initial weights: Xavier's uniform ones and zero biases, for `network.apply`."""
+    """Set RLPD's initial weights: Xavier uniform with zero biases, by `network.apply(xavier)`."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.xavier_uniform_(module.weight)
         assert module.bias is not None

@@ -12,6 +12,7 @@ from wpt_agents.model.sizes import Size
 def split_gates(gates: Tensor, blocks: int, layout: str) -> tuple[Tensor, ...]:
     """Split the (N, 3 D) outputs of a GRU's last layer into its gates, each (N, b, D / b).
 
+    :param blocks: b
     :param layout: `Size.gates`; with "across" a unit gets the gates that other blocks computed
     :return: reset, candidate and update
     """
@@ -21,7 +22,7 @@ def split_gates(gates: Tensor, blocks: int, layout: str) -> tuple[Tensor, ...]:
 
 
 class BlockGRU(nn.Module):
-    """f: a GRU whose recurrent weights are block-diagonal; every block sees all of z and a."""
+    """The function f: a GRU with block-diagonal recurrent weights; each block sees all of z, a."""
 
     def __init__(self, size: Size, action_dim: int) -> None:
         super().__init__()

@@ -18,7 +18,7 @@ from wpt_agents.model.sizes import Size
 
 
 def to_unit(image: Tensor) -> Tensor:
-    """Convert pixels: (...) uint8 -> (...) float32 in [-0.5, 0.5]."""
+    """Scale pixels to [-0.5, 0.5]: (...) uint8 -> (...) float32."""
     return image.float().div_(255).sub_(0.5)
 
 
@@ -28,7 +28,7 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """e(o): four strided convolutions, 64 > 31 > 14 > 6 > 2 pixels a side, flattened.
+    """The encoder e(o): four convolutions of stride 2, 64 > 31 > 14 > 6 > 2 pixels a side.
 
     :param depth: channels of the first layer, doubled in every further layer
     :param channels_in: 3 for one image, 3 F for F stacked images
@@ -47,7 +47,7 @@ class Encoder(nn.Module):
         self.embed_dim = 8 * depth * 2 * 2
 
     def forward(self, image: Tensor) -> Tensor:
-        """(..., 64, 64, channels_in) uint8 -> (..., E)."""
+        """Encode images: (..., 64, 64, channels_in) uint8 -> (..., E)."""
         assert image.shape[-3:-1] == (64, 64) and image.dtype == torch.uint8, image.shape
         row_size = 31 * 31 * self.depth  # of the first layer's output
         x = over_rows(self._features, row_size, image.flatten(0, -4))
@@ -59,7 +59,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """The mean of p(o | h, z): the sum of an MLP of h and one of z, then 1 > 5 > 13 > 30 > 64.
+    """The decoder d, the mean of p(o | h, z): MLPs of h and z, then 1 > 5 > 13 > 30 > 64 pixels.
 
     The output is not squashed into [-0.5, 0.5]: the squared error of Eq. (1) pulls it there.
     """
@@ -95,16 +95,16 @@ class Decoder(nn.Module):
         self.row_size = 32 * 32 * max(depth, 12)
 
     def forward(self, deter: Tensor, stoch: Tensor) -> Tensor:
-        """(N, D), (N, S, K) -> (N, 64, 64, 3), about -0.5 .. 0.5."""
+        """Decode states to images, about -0.5 .. 0.5: (N, D), (N, S, K) -> (N, 64, 64, 3)."""
         return over_rows(self.images, self.row_size, self.code(deter, stoch))
 
     def code(self, deter: Tensor, stoch: Tensor) -> Tensor:
-        """(N, D), (N, S, K) -> (N, C, 5, 5), from which `images` makes the images."""
+        """Return the input of `images`: (N, D), (N, S, K) -> (N, C, 5, 5)."""
         pixel = self.from_deter(deter) + self.from_stoch(stoch.flatten(1))
         code: Tensor = self.layers[0](pixel[..., None, None])
         return code
 
     def images(self, code: Tensor) -> Tensor:
-        """(N, C, 5, 5) -> (N, 64, 64, 3)."""
+        """Return the images of the output of `code`: (N, C, 5, 5) -> (N, 64, 64, 3)."""
         images: Tensor = self.layers[1:](code).permute(0, 2, 3, 1)
         return images

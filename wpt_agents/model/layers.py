@@ -34,7 +34,7 @@ class Linear(nn.Linear):
 class BlockLinear(nn.Module):
     """A linear layer whose weight is block-diagonal: `blocks` blocks of inputs/b -> outputs/b.
 
-    The fan-in of a unit is the width of its block, and the initial weights are scaled accordingly.
+    The fan-in of a unit is inputs/b, and the initial weights are scaled accordingly.
     """
 
     def __init__(self, inputs: int, outputs: int, blocks: int) -> None:
@@ -88,7 +88,7 @@ class UpConv(nn.ConvTranspose2d):
 
 
 class Head(nn.Module):
-    """An MLP over s = [h, z]: the sum of a layer of h and one of z, then `layers` hidden layers.
+    """An MLP of s = [h, z]: the sum of a layer of h and one of z, then `layers` hidden layers.
 
     :param size: the widths
     :param layers: number of hidden layers
@@ -118,7 +118,7 @@ class Head(nn.Module):
             nn.init.zeros_(last.bias)
 
     def forward(self, feat: Tensor) -> Tensor:
-        """(..., D + S*K) -> (..., outputs)."""
+        """Return the outputs: (..., D + S*K) -> (..., outputs)."""
         out = over_rows(self._rows, 2 * self.units, feat.reshape(-1, feat.shape[-1]))
         return out.reshape(*feat.shape[:-1], out.shape[-1])
 
@@ -130,7 +130,7 @@ class Head(nn.Module):
 
 
 def scale_gradient(x: Tensor, weight: float) -> Tensor:
-    """Return x, whose gradient is multiplied by `weight`; 0: detached."""
+    """Return x with a gradient that is multiplied by `weight`; 0 detaches it."""
     if weight == 0:
         return x.detach()
     return x if weight == 1 else weight * x + (1 - weight) * x.detach()

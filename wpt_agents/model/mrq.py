@@ -21,6 +21,9 @@ STRIDES = (2, 2, 2, 1)  # of 3x3 kernels: 64 > 31 > 15 > 7 > 5 pixels a side
 class NormedMLP(nn.Module):
     """Two hidden layers, each followed by a layer norm without weights and an activation.
 
+    :param inputs: width of the input
+    :param hidden: width of the hidden layers
+    :param outputs: width of the output
     :param activation: "elu" or "relu"
     """
 
@@ -39,9 +42,9 @@ class NormedMLP(nn.Module):
 
 
 class StateEncoder(nn.Module):
-    """z_s = f(o): four convolutions with ELU, then a linear layer, a layer norm and ELU.
+    """The encoder z_s = f(o): four convolutions with ELU, a linear layer, a layer norm, ELU.
 
-    :param channels: of each convolution
+    :param channels: number of channels of each convolution
     :param width: Z, of z_s
     """
 
@@ -57,7 +60,7 @@ class StateEncoder(nn.Module):
         self.last = nn.Linear(channels * side**2, width)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(N, F, 64, 64, 3) uint8, oldest first -> (N, Z)."""
+        """Encode stacks of frames, oldest first: (N, F, 64, 64, 3) uint8 -> (N, Z)."""
         x = image.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255 - 0.5
         for layer in self.layers:
             x = F.elu(layer(x))
@@ -67,7 +70,7 @@ class StateEncoder(nn.Module):
 class ModelEncoder(nn.Module):
     """The encoders f and g, and the linear map m from z_sa to end, next z_s and reward.
 
-    :param channels: of each convolution
+    :param channels: number of channels of each convolution
     :param width: Z, of z_s and z_sa
     :param hidden: width of the MLP of g
     :param action_dim: A
@@ -93,7 +96,7 @@ class ModelEncoder(nn.Module):
 
 
 class ValuePair(nn.Module):
-    """Q_1 and Q_2 of z_sa: three hidden layers with layer norm and ELU.
+    """The value functions Q_1 and Q_2 of z_sa: three hidden layers with layer norm and ELU.
 
     :param width: Z
     :param hidden: width of the hidden layers
@@ -105,18 +108,18 @@ class ValuePair(nn.Module):
         self.heads = nn.ModuleList(nn.Linear(hidden, 1) for _ in range(2))
 
     def forward(self, z_sa: Tensor) -> Tensor:
-        """(N, Z) -> (2, N)."""
+        """Return both values: (N, Z) -> (2, N)."""
         both = zip(self.bodies, self.heads, strict=True)
         return torch.stack([head(F.elu(normed(body(z_sa)))) for body, head in both]).squeeze(-1)
 
 
 def normed(x: Tensor) -> Tensor:
-    """Layer norm without weights, over the last axis: (..., W) -> (..., W)."""
+    """Apply a layer norm without weights over the last axis: (..., W) -> (..., W)."""
     return F.layer_norm(x, x.shape[-1:])
 
 
 def xavier_relu(module: nn.Module) -> None:
-    """MR.Q's initial weights: Xavier's uniform ones times sqrt 2, zero biases, for `apply`."""
+    """Set MR.Q's initial weights: Xavier uniform times sqrt 2, zero biases; for `apply`."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.xavier_uniform_(module.weight, nn.init.calculate_gain("relu"))
         assert module.bias is not None
@@ -124,14 +127,15 @@ def xavier_relu(module: nn.Module) -> None:
 
 
 def reward_bins(device: torch.device | str = "cpu") -> Tensor:
-    """The values of the bins, (BINS,): symexp of even steps over [-10, 10]."""
+    """Return the values of the bins, (BINS,): symexp of evenly spaced numbers in [-10, 10]."""
     return symexp(torch.linspace(-10, 10, BINS, device=device))
 
 
 def reward_two_hot(reward: Tensor) -> Tensor:
-    """Weights on the two bins around a reward whose mean is the reward: (...) -> (..., BINS).
+    """Express a reward as weights of the two nearest bins: (...) -> (..., BINS).
 
-    DreamerV3's `two_hot` interpolates symlog(reward) instead.
+    The weighted mean of the bins is the reward; DreamerV3's `two_hot` interpolates symlog(reward)
+    instead.
     """
     bins = reward_bins(reward.device)
     reward = reward.clamp(bins[0], bins[-1])
@@ -151,11 +155,12 @@ def encoder_loss(
 ) -> Tensor:
     """Sum over H steps of `λ_d |m_z - z̄|² + λ_r CE(m_r, r) + λ_e (m_e - end)²`.
 
-    The prediction of each step is the input of the next one. Steps behind the end of an episode
-    count nothing.
+    The prediction of each step is the input of the next one. Steps after the end of an episode do
+    not count.
 
     :param target: (N, H, Z), z̄ of what each step led to, by the target encoder
     :param weights: λ_d, λ_r, λ_e of dynamics, reward and end
+    :return: scalar
     """
     dynamics, of_reward, of_end = weights
     z = encoder.state(batch.image)
@@ -176,15 +181,18 @@ def scaled_target(
     """Target y = (R + D s' min_k Qbar_k) / s: values in units of the mean absolute reward s.
 
     :param reward: (N,), the n-step sum
-    :param discount: (N,), γ^n, or 0 behind a terminal state
-    :param next_q: (2, N), of the target networks, in units of `next_scale`
+    :param discount: (N,), D = γ^n, or 0 after a terminal state
+    :param next_q: (2, N), the values of the target networks, in units of `next_scale`
+    :param scale: s
+    :param next_scale: s'
+    :return: (N,), y
     """
     assert reward.shape == discount.shape == next_q.shape[1:], (reward.shape, next_q.shape)
     return (reward + discount * next_scale * next_q.amin(0)) / scale
 
 
 def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
-    """Huber's loss, each row weighing `p = max(δ_1, δ_2, 1)^α` over the mean p; δ are the errors.
+    """Huber loss, in which a row weighs `p = max(δ_1, δ_2, 1)^α` over the mean p; δ are errors.
 
     MR.Q draws transitions in proportion to p, the larger error of both value functions. On uniform
     draws these weights give the same expected gradient, and there are no priorities to keep
@@ -192,6 +200,7 @@ def value_loss(q: Tensor, target: Tensor, alpha: float = 0.4) -> Tensor:
 
     :param q: (2, N)
     :param target: (N,); no gradient reaches it
+    :return: scalar
     """
     target = target.detach().expand_as(q)
     error = (q.detach() - target).abs()
@@ -205,11 +214,12 @@ def actor_loss(q: Tensor, before_tanh: Tensor, weight: float = 1e-5) -> Tensor:
 
     :param q: (2, N), of the actor's actions
     :param before_tanh: (N, A), u
+    :return: scalar
     """
     return -q.mean() + weight * before_tanh.square().mean()
 
 
 def noisy(action: Tensor, std: float, clip: float, generator: Generator | None) -> Tensor:
-    """clamp(a + clip(ε, -c, c)), ε ~ N(0, σ²)."""
+    """Return clamp(a + clip(ε, -c, c)), ε ~ N(0, σ²): (N, A) -> (N, A)."""
     noise = std * torch.randn(action.shape, device=action.device, generator=generator)
     return (action + noise.clamp(-clip, clip)).clamp(-1, 1)

@@ -1,4 +1,4 @@
-"""Observations as the networks take them: images of (n, 64, 64, 3) uint8, and nothing else."""
+"""Conversion of observations to the input of the networks, images of (n, 64, 64, 3) uint8."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +19,7 @@ CHANNELS = {1: "grayscale", 3: "colour", 4: "RGBA"}
 def channel_axis(shape: tuple[int, ...]) -> int | None:
     """Return the axis of an image's 1, 3 or 4 channels, 2 or 0, or None if it is no image.
 
-    :param shape: of one image; colour is looked for before grayscale and RGBA
+    :param shape: the shape of one image; 3 channels take precedence over 1 and 4
     """
     if len(shape) != 3:
         return None
@@ -48,7 +48,7 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
     transparency) is left out, and other sizes are resized.
 
     :param image_key: the entry to take from a dictionary; its only image if None
-    :raises ValueError: anything that is no uint8 image, such as all that `reset` returns
+    :raises ValueError: anything that is no uint8 image, such as the tuple that `reset` returns
     """
     if isinstance(observation, tuple) and any(
         isinstance(part, Mapping) for part in observation[1:]
@@ -80,7 +80,7 @@ def to_images(observation: Observation, image_key: str | None = None) -> tuple[n
 
 
 def _remedy(observation: np.ndarray, shaped: bool) -> str:
-    """Return how to convert the values of an observation to an image.
+    """Return the advice how to convert the values of an observation to an image.
 
     :param shaped: whether it has the shape of an image, or of a batch
     """
@@ -129,7 +129,8 @@ def _range(observation: np.ndarray) -> str:
 def check_episode_start(episode_start: Any, n: int) -> np.ndarray:
     """Return one bool for each of n environments, all False for None.
 
-    :raises ValueError: another number of them
+    :param episode_start: n bools, or None
+    :raises ValueError: another number of bools
     """
     first = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool)
     if first.shape == () and n == 1:
@@ -143,9 +144,11 @@ def check_episode_start(episode_start: Any, n: int) -> np.ndarray:
 
 
 def check_state(state: Any, shapes: tuple[tuple[int, ...], ...], n: int) -> None:
-    """Refuse a recurrent state of another model.
+    """Raise a ValueError for the recurrent state of another model.
 
-    :param shapes: of its arrays, without the axis of the environments
+    :param state: the state to check
+    :param shapes: the shapes of this model's arrays, without the axis of the environments
+    :param n: the number of environments
     :raises ValueError: another kind of state, or one of another number of environments
     """
     remedy = "pass the state that this model's own predict returned, or None"

@@ -83,13 +83,13 @@ def definitions() -> Iterator[None]:
 
 @op
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """The product x W^T + b: (..., inputs), (outputs, inputs) -> (..., outputs)."""
+    """Return x W^T + b: (..., inputs), (outputs, inputs) -> (..., outputs)."""
     return F.linear(x, weight, bias)
 
 
 @op
 def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """The product with a block-diagonal W.
+    """Return the product with a block-diagonal weight.
 
     :param x: (N, inputs)
     :param weight: (b, inputs / b, outputs / b), the b blocks
@@ -101,7 +101,7 @@ def block_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tenso
 
 @op
 def shared_block_linear(private: Tensor, shared: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A `block_linear` of which each block sees its private inputs and all of the shared ones.
+    """Return a `block_linear` whose blocks each see their private and all shared inputs.
 
     :param private: (N, inputs), divided among the b blocks
     :param shared: (N, more inputs), which follow the private ones in the view of each block
@@ -115,13 +115,13 @@ def shared_block_linear(private: Tensor, shared: Tensor, weight: Tensor, bias: T
 
 @op
 def down_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A convolution of stride 2: (N, inputs, H, W) -> (N, outputs, (H - K) // 2 + 1, ...)."""
+    """Convolve with stride 2: (N, inputs, H, W) -> (N, outputs, (H - K) // 2 + 1, ...)."""
     return F.conv2d(x, weight, bias, stride=2)
 
 
 @op
 def up_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A transposed convolution of stride 2: (N, inputs, H, W) -> (N, outputs, 2H + K - 2, ...)."""
+    """Convolve, transposed, with stride 2: (N, inputs, H, W) -> (N, outputs, 2H + K - 2, ...)."""
     return F.conv_transpose2d(x, weight, bias, stride=2)
 
 
@@ -129,6 +129,9 @@ def up_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 def over_rows(layers: Callable[..., Tensor], row_size: int, *inputs: Tensor) -> Tensor:
     """Apply layers that compute each row of a batch independently of the others.
 
-    :param row_size: how many numbers a row has in the largest tensor that the layers make of it
+    :param layers: a function of `inputs`
+    :param row_size: numbers per row in the largest tensor that the layers compute
+    :param inputs: tensors with N rows
+    :return: the output of `layers`, with N rows
     """
     return layers(*inputs)

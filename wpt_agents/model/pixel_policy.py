@@ -1,4 +1,4 @@
-"""What all policies have in common: `predict` for environments, on top of `act` for networks."""
+"""The base of all policies: `predict` converts what environments and `act` exchange."""
 
 from abc import abstractmethod
 
@@ -31,7 +31,7 @@ class PixelPolicy(BasePolicy):
         """Return actions (n, A) in [-1, 1] for images (n, 64, 64, 3), and the next state."""
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
-        """(n, A) in [-1, 1] -> (n, width) in the bounds of the environment's own action space."""
+        """Map actions (n, A) in [-1, 1] to the bounds of the environment's actions, (n, width)."""
         return to_bounds(action, self.action_space)
 
     def predict(
@@ -46,7 +46,11 @@ class PixelPolicy(BasePolicy):
         :param observation: (64, 64, 3) or (n, 64, 64, 3) uint8; channels first and other sizes
             are converted
         :param state: what the last call returned; None at the start
-        :param episode_start: (n,) bool, where an episode begins; None for nowhere
+        :param episode_start: (n,) bool, the environments whose episode has just begun; None for
+            none
+        :param deterministic: act without random numbers
+        :return: (width,) or (n, width) in the bounds of the environment's actions, and the next
+            state
         """
         images, batched = to_images(observation, self.image_key)
         action, state = self.act(images, state, episode_start, deterministic)

@@ -49,7 +49,7 @@ class WPTPolicy(PixelPolicy):
     :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start reward head and critic at zero
     :param actor_outscale: factor on the initial weights of the actor's last layer
-    :param bin_range: largest value of reward head and critic, in symlog space
+    :param bin_range: largest bin of reward head and critic, in symlog space
     :param reward_ensemble: number of reward heads
     :param continue_head: predict where episodes end
     :param ibrl: take the prior actor's action where it is worth more than the actor's
@@ -98,7 +98,7 @@ class WPTPolicy(PixelPolicy):
         self.set_action_space(action_space)
 
     def reset_behavior(self) -> None:
-        """Draw new weights for all that belongs to a task: reward head, actors, critics."""
+        """Initialise the networks of a task again: reward head, actors and critics."""
         size = self.size
         device = self.device
         self.world_model.reset_heads()
@@ -128,7 +128,7 @@ class WPTPolicy(PixelPolicy):
         return super().load_state_dict(state_dict, strict, assign)
 
     def fit_actors(self, weights: Mapping[str, Any]) -> None:
-        """Add or remove imitator and averages, as the names of these weights say."""
+        """Add or remove imitator and averages, so that these weights can be loaded."""
         for name in ("imitator", "average_actor", "average_imitator"):
             there = any(weight.startswith(f"{name}.") for weight in weights)
             if there != (getattr(self, name) is not None):
@@ -147,16 +147,16 @@ class WPTPolicy(PixelPolicy):
 
     @property
     def acting_actor(self) -> Actor:
-        """The actor that decides in the environment; dreams are always the actor's that learns."""
+        """The actor that acts in the environment, the average if there is one."""
         return self.actor if self.average_actor is None else self.average_actor
 
     @property
     def acting_imitator(self) -> Actor | None:
-        """The imitator to compare `acting_actor` with, averaged if that is."""
+        """The imitator to compare `acting_actor` with; also an average if that is one."""
         return self.imitator if self.average_imitator is None else self.average_imitator
 
     def begin_residual(self) -> None:
-        """Copy the actor: its difference to this imitator is added to the prior actor's action."""
+        """Copy the actor to the imitator; their difference is added to the prior actor's action."""
         self.imitator = deepcopy(self.actor)
         self.average_imitator = deepcopy(self.average_actor)
 
@@ -190,8 +190,8 @@ class WPTPolicy(PixelPolicy):
         :param image: (n, 64, 64, 3) uint8
         :param state: from the step before, or None
         :param episode_start: (n,) bool, where the state is reset
-        :param deterministic: take the most likely latent and the mean action
-        :param generator: of the draws; torch's own if None
+        :param deterministic: take the most likely latent state and the mean action
+        :param generator: source of the random numbers; torch's own if None
         :return: action (n, A) in [-1, 1], zero in the padding, and the new state
         """
         n = len(image)
@@ -217,12 +217,14 @@ class WPTPolicy(PixelPolicy):
             decision = actor_or_prior(self, post, decision, self._tensor(frames[0]))
         action = decision.cpu().numpy()
         if not np.isfinite(action).all():
-            raise ValueError("The actor's output is not finite: the weights are damaged")
+            raise ValueError(
+                "The actor's output is not finite: the weights are damaged, load an earlier model"
+            )
         latent = [x.cpu().numpy() for x in post]
         return action, (*latent, *frames, action)
 
     def _with_frames(self, state: State, image: np.ndarray) -> State:
-        """Add or remove the images of a state, so that keywords can change within an episode."""
+        """Add or remove the images of a state, as keywords may change within an episode."""
         parts = len(state) if isinstance(state, tuple | list) else 0
         if self.sees_frames and parts == 3:
             return (*state[:2], stack_frames(image, None, None), state[2])
@@ -241,7 +243,7 @@ class WPTPolicy(PixelPolicy):
         return torch.from_numpy(np.asarray(array)).to(self.action_mask.device)
 
     def dream(self, start: Latent, horizon: int, generator: Generator | None = None) -> Dream:
-        """Imagine with the actor in the frozen world model; gradients run through the dynamics.
+        """Imagine with the actor; gradients pass the world model without reaching its weights.
 
         :param start: (N, ...), the states to start from
         :param horizon: H
@@ -255,7 +257,7 @@ class WPTPolicy(PixelPolicy):
         return np.asarray(self.world_model.encoder(self._tensor(image)).float().cpu())
 
     def encoder_id(self) -> str:
-        """Return a hash of the encoder's weights, stored with features that it computed."""
+        """Return a hash of the encoder's weights, which is stored with the features."""
         digest = hashlib.sha256()
         for tensor in self.world_model.encoder.state_dict().values():
             digest.update(tensor.cpu().numpy().tobytes())
@@ -263,9 +265,9 @@ class WPTPolicy(PixelPolicy):
 
     @torch.no_grad()
     def open_loop(self, trajectory: Trajectory, context: int = 5, horizon: int = 40) -> np.ndarray:
-        """Predict a trajectory's images: `context` reconstructions, then a dream.
+        """Predict a trajectory's images: `context` reconstructions, then predictions.
 
-        :return: (context + horizon or the trajectory's images, 64, 64, 3) uint8
+        :return: (context + horizon, 64, 64, 3) uint8, or fewer images if the trajectory is shorter
         """
         stop = min(context + horizon, len(trajectory) + 1)
         batch = stack_windows([led_to(trajectory, 0, stop, self.max_action_dim)])
@@ -277,7 +279,7 @@ class WPTPolicy(PixelPolicy):
     def heldout_errors(self, trajectory: Trajectory, images: int = 256) -> dict[str, float]:
         """Measure the world model's errors on an episode with rewards, not yet replayed.
 
-        :param images: the most images that are used, from the episode's start
+        :param images: largest number of images to use, from the episode's start
         :return: `reconstruction`, the squared error of Eq. (1) summed over an image, and `reward`,
             the mean absolute error; both averaged over the steps
         """

@@ -22,7 +22,7 @@ class HasPriorActor(Protocol):
         """Where the weights are."""
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
-        """(n, A) in [-1, 1] -> (n, A) in the bounds of the environment's actions."""
+        """Map actions (n, A) in [-1, 1] to the bounds of the environment's actions."""
 
 
 class PriorPolicy:
@@ -54,6 +54,6 @@ class PriorPolicy:
 
 @torch.no_grad()
 def prior_action(policy: HasPriorActor, frames: np.ndarray) -> np.ndarray:
-    """(n, F, 64, 64, 3) -> (n, A) in [-1, 1]."""
+    """Return the prior actor's actions: (n, F, 64, 64, 3) uint8 -> (n, A) in [-1, 1]."""
     images = torch.from_numpy(frames).to(policy.device)
     return np.asarray(policy.prior_actor.act(images, policy.action_mask).cpu())

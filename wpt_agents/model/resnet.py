@@ -15,7 +15,7 @@ SIDE = 224  # pixels of the images that the published networks were trained on
 
 
 class Block(nn.Module):
-    """A residual block: two 3x3 convolutions, or 1x1, 3x3, 1x1 with four times as many outputs."""
+    """A residual block: two 3x3 convolutions, or a bottleneck of 1x1, 3x3 and 1x1 convolutions."""
 
     def __init__(self, inputs: int, width: int, stride: int, bottleneck: bool) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class ResNet(nn.Module):
         return super().train(False)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(N, H, W, 3) in 0 to 255 -> (N, features); images are resized to 224 pixels."""
+        """Encode images of 0 to 255, resized to 224 x 224: (N, H, W, 3) -> (N, features)."""
         x = image.permute(0, 3, 1, 2).float() / 255
         if x.shape[-2:] != (SIDE, SIDE):
             x = nn.functional.interpolate(x, (SIDE, SIDE), mode="bilinear", antialias=True)
@@ -95,7 +95,9 @@ def read_r3m(path: str) -> dict[str, Tensor]:
     The file holds `{"r3m": {"module.convnet.<name>": ..., "module.lang_enc.<name>": ..., ...}}`;
     the parts for language are left out.
 
-    :raises ValueError: another layout
+    :param path: the file
+    :return: the weights of a `ResNet` by name
+    :raises ValueError: a file of another layout
     """
     content = torch.load(path, map_location="cpu", weights_only=True)
     prefix = "module.convnet."

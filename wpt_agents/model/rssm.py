@@ -17,14 +17,14 @@ LOGITS_SCALE = 4.0  # chosen by validation error and probes after 1,000 updates 
 
 
 class Latent(NamedTuple):
-    """s = [h, z]: `deter` (..., D) and `stoch` (..., S, K), one-hot in each group."""
+    """Latent state s = [h, z]: `deter` (..., D) and `stoch` (..., S, K), one-hot in each group."""
 
     deter: Tensor
     stoch: Tensor
 
     @property
     def feat(self) -> Tensor:
-        """(..., D + S*K)."""
+        """Both parts as one vector: (..., D + S*K)."""
         return torch.cat([self.deter, self.stoch.flatten(-2)], -1)
 
     def detach(self) -> "Latent":
@@ -36,15 +36,15 @@ class Latent(NamedTuple):
         return [Latent(*step) for step in zip(*(x.unbind(1) for x in self), strict=True)]
 
     def but_last(self) -> "Latent":
-        """(N, H + 1, ...) -> (N, H, ...)."""
+        """Return all states but the last one: (N, H + 1, ...) -> (N, H, ...)."""
         return Latent(self.deter[:, :-1], self.stoch[:, :-1])
 
     def pick(self, index: Tensor) -> "Latent":
-        """(N, ...) -> (len(index), ...), the states of these numbers."""
+        """Return the states with these indices: (N, ...) -> (len(index), ...)."""
         return Latent(self.deter[index], self.stoch[index])
 
     def flatten_time(self) -> "Latent":
-        """(B, T, ...) -> (B*T, ...)."""
+        """Merge batch and time: (B, T, ...) -> (B*T, ...)."""
         return Latent(self.deter.flatten(0, 1), self.stoch.flatten(0, 1))
 
 
@@ -55,7 +55,7 @@ def stack_time(states: list[Latent]) -> Latent:
 
 
 class RSSM(nn.Module):
-    """Filters with images (`observe`) and imagines without them (`imagine`).
+    """The RSSM, which filters with images (`observe`) and imagines without them (`imagine`).
 
     :param size: the widths
     :param action_dim: the padded action width
@@ -107,16 +107,16 @@ class RSSM(nn.Module):
         return Latent(zeros(n, size.deter), zeros(n, size.stoch, size.classes))
 
     def step(self, state: Latent, action: Tensor) -> Tensor:
-        """h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): (N, D)."""
+        """Return h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): (N, ...), (N, A) -> (N, D)."""
         deter: Tensor = self.gru(state.deter, state.stoch, self.gru.from_action(action))
         return deter
 
     def prior(self, deter: Tensor) -> Tensor:
-        """p(z | h): (..., D) -> (..., S, K) log-probabilities."""
+        """Return p(z | h) as log-probabilities: (..., D) -> (..., S, K)."""
         return self._log_probs(self.prior_net(deter))
 
     def posterior(self, deter: Tensor, embed: Tensor) -> Tensor:
-        """q(z | h, o): (..., D), (..., E) -> (..., S, K) log-probabilities."""
+        """Return q(z | h, o) as log-probabilities: (..., D), (..., E) -> (..., S, K)."""
         return self.posterior_of_halves(deter, self.embed_half(embed))
 
     def embed_half(self, embed: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ class RSSM(nn.Module):
         return linear(embed, self.post_in.weight[:, self.size.deter :], self.post_in.bias)
 
     def posterior_of_halves(self, deter: Tensor, embed_half: Tensor) -> Tensor:
-        """q(z | h, o) with the result of `embed_half`: (..., D), (..., hidden) -> (..., S, K)."""
+        """Return q(z | h, o) from `embed_half`: (..., D), (..., hidden) -> (..., S, K)."""
         deter_half = linear(deter, self.post_in.weight[:, : self.size.deter])
         return self._log_probs(self.post_out(deter_half + embed_half))
 
@@ -167,7 +167,7 @@ class RSSM(nn.Module):
         generator: Noise = None,
         sample: bool = True,
     ) -> tuple[Latent, Tensor]:
-        """`observe` without the prior, which acting does not need; the parameters are the same.
+        """Filter as `observe` does, with the same parameters, but without computing the prior.
 
         :return: the posterior Latent (B, T, ...), and post_logits (B, T, S, K)
         """
@@ -189,7 +189,7 @@ class RSSM(nn.Module):
         generator: Noise = None,
         sample: bool = True,
     ) -> tuple[Latent, Tensor]:
-        """Roll p(z | h) out under a policy.
+        """Imagine a trajectory: sample p(z | h) step by step with the actions of a policy.
 
         :param state: where to start, (N, ...)
         :param policy: (state, t) -> action (N, A)
@@ -231,9 +231,10 @@ def filter_step(
 ) -> tuple[Latent, Tensor]:
     """Make one step of filtering: h_t = f(h_{t-1}, z_{t-1}, a_{t-1}), then z_t ~ q(z | h_t, o_t).
 
-    :param state: of the step before, (N, ...)
-    :param action_embed: (N, hidden), of the action that led to the image, or of zeros where reset
-    :param embed_half: (N, hidden), what `RSSM.embed_half` makes of the encoded image
+    :param state: the state of the step before, (N, ...)
+    :param action_embed: (N, hidden), the embedded action that led to the image, or zeros where the
+        state is reset
+    :param embed_half: (N, hidden), the result of `RSSM.embed_half` for the encoded image
     :param is_first: (N,) bool, where the state is reset to zero
     :return: the posterior state and its log-probabilities (N, S, K)
     """
@@ -269,5 +270,5 @@ def filter_sequence(
 
 @op
 def over_steps(head: Callable[[Tensor], Tensor], states: Latent) -> Tensor:
-    """Apply a head to the features of N states at each of H steps: (N, H, ...)."""
+    """Apply a head to the features of states (N, H, ...), step by step: (N, H, ...)."""
     return head(states.feat)

@@ -15,7 +15,8 @@ GATES = ("within", "across")
 class Size:
     """The widths of all networks, and the learning rates and budgets that suit them.
 
-    The defaults of rates and budgets are Table 2's, so a `Size` of new widths has those.
+    The defaults of learning rates and budgets are those of Table 2, also for a `Size` with other
+    widths.
 
     :param deter: width of h
     :param hidden: width of the layers inside the RSSM
@@ -27,16 +28,16 @@ class Size:
     :param actor_critic_learning_rate: for the actor and the critic
     :param stabilised: whether heads start at zero and returns are normalised, as in DreamerV3
     :param blocks: number of blocks of the block-diagonal layers
-    :param gates: how the GRU's last layer orders its gates: "within" each block, as DreamerV3, or
-        "across" the blocks, as the weights that the paper's authors publish
+    :param gates: how the GRU's last layer orders its gates: "within" each block, as in DreamerV3,
+        or "across" the blocks, as in the weights that the paper's authors publish
     :param norm_eps: eps of every layer norm except those over a convolution's channels (1e-3)
-    :param imagine_starts: states that dreams start from in an update; 0 for all of them
+    :param imagine_starts: states from which imagination starts in an update; 0 for all of them
     :param pretrain_steps: updates of the world model in pre-training
     :param num_retrieve: trajectories to retrieve for a task
     :param bc_steps: updates of the prior actor
     :param bc_batch_size: images and actions in an update of the prior actor
     :param learning_starts: steps that are collected before the first update
-    :param warmup_steps: steps that the prior actor alone drives
+    :param warmup_steps: steps in which the prior actor alone acts
     :param guidance: schedule of the probability that an episode is guided
     """
 
@@ -152,6 +153,6 @@ def find_size(size: str | Size | Mapping[str, Any]) -> Size:
 
 
 def plain_size(size: str | Size | Mapping[str, Any]) -> str | dict[str, Any]:
-    """Return the name of a size, or its fields if it has none: what a model file can store."""
+    """Return the name of a size, or its fields if it has no name, as a model file stores it."""
     widths = find_size(size)
     return next((name for name, known in SIZES.items() if known == widths), asdict(widths))

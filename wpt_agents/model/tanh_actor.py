@@ -12,7 +12,7 @@ LOG_STD = -20.0, 2.0  # bounds of the Gaussian's log standard deviation
 
 
 class TanhActor(nn.Module):
-    """π(a | h) = tanh of a Gaussian: a trunk of its own, then an MLP to mean and log std.
+    """The policy π(a | h), tanh of a Gaussian: a trunk, then an MLP to mean and log std.
 
     :param embed_dim: E, the width of the encoder's output
     :param features: width of the trunk's latent
@@ -26,7 +26,7 @@ class TanhActor(nn.Module):
         self.layers = mlp(features, hidden, 2 * action_dim)
 
     def forward(self, embed: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, E) -> mean and log std of the Gaussian before tanh, (N, A) each."""
+        """Return mean and log std of the Gaussian before tanh: (N, E) -> (N, A), (N, A)."""
         mean, log_std = self.layers(self.trunk(embed)).chunk(2, -1)
         return mean, log_std.clamp(*LOG_STD)
 
@@ -34,13 +34,13 @@ class TanhActor(nn.Module):
 def tanh_sample(
     mean: Tensor, log_std: Tensor, generator: Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Action a = tanh(u), u = μ + σ ε, and log π(a) = Σ log N(u; μ, σ²) - log(1 - tanh² u).
+    """Draw a = tanh(u), u = μ + σ ε; log π(a) = Σ log N(u; μ, σ²) - log(1 - tanh² u).
 
     log(1 - tanh² u) = 2 (log 2 - u - softplus(-2 u)), which does not overflow.
 
     :param mean: (N, A)
     :param log_std: (N, A)
-    :return: (N, A) and (N,)
+    :return: a, (N, A), and log π(a), (N,)
     """
     noise = torch.randn(mean.shape, device=mean.device, generator=generator)
     u = mean + log_std.exp() * noise

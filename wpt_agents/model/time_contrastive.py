@@ -14,13 +14,13 @@ from torch import Tensor
 
 
 def similarity(x: Tensor, y: Tensor) -> Tensor:
-    """S(x, y) = -||x - y||_2: (..., Z), (..., Z) -> (...)."""
+    """Return the similarity S(x, y) = -||x - y||_2: (..., Z), (..., Z) -> (...)."""
     # Clamped, because the square root has no gradient at 0.
     return -(x - y).square().sum(-1).clamp_min(1e-12).sqrt()
 
 
 def time_contrastive_loss(z: Tensor, others: Tensor) -> Tensor:
-    """Images of a clip that are near in time are more similar than those farther or elsewhere.
+    """The loss by which images that are near in time become more similar than others.
 
     For s0 < s1 <= s2 it is the mean of
     -log[e^S(s1,s2) / (e^S(s1,s2) + e^S(s0,s2) + Σ e^S(s2,s2'))] and
@@ -28,6 +28,7 @@ def time_contrastive_loss(z: Tensor, others: Tensor) -> Tensor:
 
     :param z: (B, 3, Z), features of the images s0, s1, s2 of each clip
     :param others: (K, B), the numbers of the clips that each clip is contrasted with
+    :return: scalar
     """
     assert z.shape[1] == 3 and others.shape[1] == len(z), (z.shape, others.shape)
     z0, z1, z2 = z.unbind(1)
@@ -48,7 +49,7 @@ def r3m_loss(z: Tensor, others: Tensor) -> Tensor:
 
 
 def aligned(z: Tensor) -> Tensor:
-    """The share of clips whose images s1, s2 are more similar than s0, s2: (B, 3, Z) -> scalar."""
+    """Return the share of clips with S(s1, s2) > S(s0, s2): (B, 3, Z) -> scalar."""
     z0, z1, z2 = z.unbind(1)
     return (similarity(z1, z2) > similarity(z0, z2)).float().mean()
 
@@ -77,14 +78,14 @@ def draw_clips(
 
 
 def derangements(size: int, count: int, rng: np.random.Generator) -> Tensor:
-    """Numbers of clips other than each clip's own: (count, size)."""
+    """Draw, `count` times, a clip other than itself for each of `size` clips: (count, size)."""
     assert size > 1, "a clip needs another one to be contrasted with"
     shift = rng.integers(1, size, (count, size))
     return torch.from_numpy((np.arange(size) + shift) % size)
 
 
 def random_crop(clips: Tensor, rng: np.random.Generator) -> Tensor:
-    """Cut out 20 to 100 % of the area and resize it, alike for the images of one clip.
+    """Cut out 20 to 100 % of the area and resize it; the same for all images of a clip.
 
     :param clips: (B, 3, 64, 64, 3) uint8
     :return: the same shape, float32 in 0 to 255

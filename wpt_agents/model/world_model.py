@@ -33,12 +33,12 @@ class WorldModelLoss(NamedTuple):
 
 
 def squared_error(image: Tensor, reconstruction: Tensor, weight: Tensor | None = None) -> Tensor:
-    """-ln p(o_t | z_t, h_t) of a Gaussian with fixed variance, up to constants.
+    """Return -ln p(o_t | z_t, h_t) of a Gaussian with fixed variance, up to constants.
 
     :param image: (..., H, W, C), the true frames in [-0.5, 0.5], their pixels in any order
     :param reconstruction: (..., H, W, C)
-    :param weight: (..., H, W, C) or broadcast to it: a pixel of the weight w has a variance that is
-        w times smaller; 1 in the paper
+    :param weight: (..., H, W, C) or a shape that is broadcast to it, the weights of the pixels; 1
+        in the paper. A weight of w means a variance that is w times smaller
     :return: (...), summed over a frame
     """
     assert image.shape == reconstruction.shape, (image.shape, reconstruction.shape)
@@ -60,7 +60,7 @@ def reconstruction_error(
     moving: Tensor | None = None,
     pixel_weight: float = 1.0,
 ) -> Tensor:
-    """The `squared_error` of N decoded states.
+    """Return the `squared_error` of N decoded states.
 
     :param latent: (N, ...)
     :param image: (N, 64, 64, 3) uint8
@@ -110,12 +110,13 @@ def world_model_loss(
 def reward_loss(
     logits: Tensor, reward: Tensor, known: Tensor, bin_range: float = BIN_RANGE
 ) -> Tensor:
-    """-ln p_xi(r_t | s_t), averaged over the steps whose reward is known (A.3, Algorithm 1).
+    """Return -ln p_xi(r_t | s_t), averaged over steps of known reward (A.3, Algorithm 1).
 
     :param logits: (B, T, bins), the reward head's output
     :param reward: (B, T)
-    :param known: (B, T) bool
-    :param bin_range: of the bins, in symlog space
+    :param known: (B, T) bool, where the reward is known
+    :param bin_range: largest bin, in symlog space
+    :return: scalar
     """
     assert logits.shape[:-1] == reward.shape == known.shape, (logits.shape, known.shape)
     # a batch of retrieved rows alone has no known reward: its loss is 0, not NaN
@@ -143,10 +144,10 @@ class WorldModel(nn.Module):
     like the reward head, of which there are none in the paper.
 
     :param size: the widths
-    :param action_dim: the padded action width
+    :param action_dim: A, the padded action width
     :param unimix: share of the uniform distribution in every latent distribution
     :param zero_init_heads: start the reward head at zero, as DreamerV3 does
-    :param bin_range: of the reward head's bins, in symlog space
+    :param bin_range: largest bin of the reward head, in symlog space
     """
 
     def __init__(
@@ -167,7 +168,7 @@ class WorldModel(nn.Module):
         self.reset_heads()
 
     def reset_heads(self) -> None:
-        """Draw a new reward head, and remove the other heads: all of them belong to a task."""
+        """Initialise the reward head again and remove the other heads, for another task."""
         # Two layers, as in the authors' code; Table 2 says three for all heads.
         self.reward_head = Head(self.size, 2, BINS, self.zero_init_heads)
         self.reward_members = nn.ModuleList()
@@ -175,20 +176,20 @@ class WorldModel(nn.Module):
 
     @property
     def heads(self) -> list[nn.Module]:
-        """All heads, which belong to a task."""
+        """All heads, which are those of a task."""
         heads: list[nn.Module] = [self.reward_head, *self.reward_members]
         return heads if self.continue_head is None else [*heads, self.continue_head]
 
     def make_reward_members(self, seeds: Sequence[int]) -> None:
-        """Replace the further reward heads by new ones, each drawn with a seed of its own."""
+        """Replace the further reward heads by new ones, each initialised with its own seed."""
         heads = [self._seeded_head(BINS, self.zero_init_heads, seed) for seed in seeds]
         self.reward_members = nn.ModuleList(heads)
 
     def make_continue_head(self, log_odds: float, seed: int) -> None:
         """Add DreamerV3's continue head, which predicts whether the episode goes on after a state.
 
-        :param log_odds: of going on, before anything is learned
-        :param seed: of its random numbers
+        :param log_odds: log-odds of continuing that the new head predicts
+        :param seed: seed of its initial weights
         """
         self.continue_head = self._seeded_head(1, zero_init=True, seed=seed)
         nn.init.constant_(self.continue_head.layers[-1].get_parameter("bias"), log_odds)
@@ -215,7 +216,7 @@ class WorldModel(nn.Module):
         return self.rssm.observe(embed, batch.action, batch.is_first, generator=generator)
 
     def decode(self, latent: Latent) -> Tensor:
-        """(B, T, ...) -> (B, T, 64, 64, 3), about -0.5 .. 0.5."""
+        """Decode states to images, about -0.5 .. 0.5: (B, T, ...) -> (B, T, 64, 64, 3)."""
         flat = latent.flatten_time()
         images: Tensor = self.decoder(flat.deter, flat.stoch)
         return images.view(*latent.deter.shape[:2], *images.shape[1:])
@@ -223,7 +224,7 @@ class WorldModel(nn.Module):
     def reconstruction_error(
         self, latent: Latent, image: Tensor, moving: Tensor | None = None, pixel_weight: float = 1.0
     ) -> Tensor:
-        """`squared_error(to_unit(image), self.decode(latent))`, (B, T).
+        """Return `squared_error(to_unit(image), self.decode(latent))`, (B, T).
 
         :param latent: (B, T, ...)
         :param image: (B, T, 64, 64, 3) uint8
@@ -252,9 +253,9 @@ class WorldModel(nn.Module):
         return torch.stack([two_hot_mean(head(feat), self.bin_range) for head in heads], -1)
 
     def goes_on(self, feat: Tensor) -> Tensor:
-        """Predict the probability that the episode goes on after a state: (..., D + S*K) -> (...).
+        """Predict the probability that the episode continues: (..., D + S*K) -> (...).
 
-        It needs the continue head.
+        The model must have the continue head.
         """
         assert self.continue_head is not None
         logits: Tensor = self.continue_head(feat)

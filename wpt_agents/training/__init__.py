@@ -1,1 +1,1 @@
-"""How an agent learns: updates, pre-training, rollouts, guidance, checks of what users pass."""
+"""How an agent learns: updates, pre-training, rollouts, guidance, checks of user input."""

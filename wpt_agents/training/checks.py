@@ -1,4 +1,4 @@
-"""Refuse what agents cannot learn from; every error names the culprit and the remedy."""
+"""Checks of user input; every error names the wrong value and the remedy."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from wpt_agents.training.spaces import IMAGE_SHAPE
 
 
 def check_device(device: torch.device | str) -> None:
-    """Refuse a device that torch cannot compute on here, instead of falling back to the CPU."""
+    """Raise a ValueError for a device that torch cannot use, instead of using the CPU."""
     if device == "auto":
         return
     try:
@@ -26,7 +26,7 @@ def check_device(device: torch.device | str) -> None:
 
 
 def check_images(dataset: TrajectoryDataset) -> None:
-    """Refuse a dataset without trajectories, or with images of another size."""
+    """Raise a ValueError for a dataset without trajectories, or with images of another size."""
     if len(dataset) == 0:
         raise ValueError(f"The dataset {dataset.path} is empty: append trajectories to it")
     if dataset.image_size != IMAGE_SIZE:
@@ -38,14 +38,15 @@ def check_images(dataset: TrajectoryDataset) -> None:
 
 
 def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length: int) -> None:
-    """Refuse a dataset that WPT cannot learn from."""
+    """Raise a ValueError for a dataset that WPT cannot learn from."""
     check_images(dataset)
     widest = max(dataset.action_dims)
     longest = max(dataset.lengths) + 1
     if widest > max_action_dim:
         raise ValueError(
             f"The dataset {dataset.path} has {widest} actions, the model at most "
-            f"max_action_dim={max_action_dim}: pass max_action_dim={widest}"
+            f"max_action_dim={max_action_dim}: pass max_action_dim={widest} to a new model, or use "
+            f"the other trajectories alone, dataset.subset(dataset.action_dims <= {max_action_dim})"
         )
     if longest < batch_length:
         raise ValueError(
@@ -55,11 +56,14 @@ def check_dataset(dataset: TrajectoryDataset, max_action_dim: int, batch_length:
 
 
 def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) -> None:
-    """Refuse a trajectory that a model cannot look at, or a context of no image."""
+    """Raise a ValueError for a trajectory that a model cannot predict, or for no context."""
     if context < 1:
         raise ValueError(f"context, the number of images seen, must be at least 1, got {context}")
     if trajectory.image.shape[1:] != IMAGE_SHAPE:
-        raise ValueError(f"The trajectory's images are {trajectory.image.shape[1:]}: resize to 64")
+        raise ValueError(
+            f"The trajectory's images are {trajectory.image.shape[1:]}, the model takes "
+            f"{IMAGE_SHAPE}: resize them by wpt_agents.data.images.resized(image, {IMAGE_SIZE})"
+        )
     if trajectory.action_dim > max_action_dim:
         raise ValueError(
             f"The trajectory has {trajectory.action_dim} actions, the model takes at most "
@@ -69,7 +73,7 @@ def check_trajectory(trajectory: Trajectory, max_action_dim: int, context: int) 
 
 
 def whole_steps(total_timesteps: Any) -> int:
-    """Return the steps that `learn` is called with as an int; refuse what is no number of steps."""
+    """Return the argument of `learn` as an int; raise a ValueError for other values."""
     if is_number(total_timesteps) and total_timesteps >= 0 and total_timesteps % 1 == 0:
         return int(total_timesteps)  # 2e4, too
     raise ValueError(
@@ -79,7 +83,11 @@ def whole_steps(total_timesteps: Any) -> int:
 
 
 def check_rewards(rewards: np.ndarray, step: int) -> None:
-    """Refuse rewards that are not finite, before they are stored."""
+    """Raise a ValueError for rewards that are not finite, before they are stored.
+
+    :param rewards: (n,), of n environments
+    :param step: the number of the step, for the message
+    """
     if not np.isfinite(rewards).all():
         i = int(np.flatnonzero(~np.isfinite(rewards))[0])
         raise ValueError(

@@ -1,4 +1,4 @@
-"""// Behavior Cloning Policy Training of Algorithm 1: the prior actor imitates trajectories."""
+"""Behaviour cloning (Algorithm 1): train the prior actor to imitate trajectories."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -26,10 +26,10 @@ from wpt_agents.training.randomness import Purpose, Streams
 
 @dataclass(frozen=True)
 class Cloning:
-    """How a prior actor is trained.
+    """The settings of behaviour cloning.
 
-    :param steps: updates
-    :param batch_size: images and actions in an update
+    :param steps: number of updates
+    :param batch_size: number of images and actions in an update
     :param learning_rate: at the first update; it falls linearly to 0
     :param shift: largest shift of the images, in pixels
     :param variance: "fixed", or "trajectory", an estimate for each trajectory
@@ -61,8 +61,14 @@ def clone(
 ) -> PriorActor:
     """Train a copy of a prior actor, so that an interruption leaves nothing half-learned.
 
-    :param action_mask: (A,) bool, True at the entries of an action that the robot has
-    :param autocast: the context of the forward passes
+    :param prior_actor: the network to start from, which is not changed
+    :param trajectories: the trajectories to imitate
+    :param action_mask: (A,) bool, False in the padding
+    :param settings: the settings
+    :param streams: source of the random numbers
+    :param progress_bar: show a progress bar
+    :param autocast: makes the context of a forward pass
+    :return: the trained copy
     """
     actor = deepcopy(prior_actor)
     device = action_mask.device

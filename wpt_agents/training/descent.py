@@ -11,6 +11,8 @@ from torch.optim import AdamW, Optimizer
 def adam(parts: list[list[nn.Parameter]], rate: float, weight_decay: float) -> Optimizer:
     """Make an Adam optimiser over parts whose gradients are clipped separately.
 
+    :param parts: the parameters of each part
+    :param rate: the learning rate
     :param weight_decay: share by which every weight shrinks in a step
     """
     groups = [{"params": part} for part in parts]
@@ -26,9 +28,9 @@ def decay(rate: float, weight_decay: float) -> float:
 def descend(optimizer: Optimizer, loss: Tensor, name: str, grad_clip: float = inf) -> Tensor:
     """Compute the gradients of a loss and take a step.
 
-    :param name: of the loss, for the error
+    :param name: name of the loss, for the error
     :param grad_clip: largest norm of the gradient of each part; infinite for no clipping
-    :return: the gradient's norm before clipping, that of the first part
+    :return: the norm of the first part's gradient before clipping
     :raises FloatingPointError: a loss or gradient that is not finite; the weights stay as they were
     """
     optimizer.zero_grad()

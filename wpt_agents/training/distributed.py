@@ -22,7 +22,7 @@ class World:
     """The processes that train together, and which of them this one is.
 
     :param rank: 0 to size - 1; rank 0 prints and writes
-    :param size: how many there are
+    :param size: the number of processes
     """
 
     rank: int = 0
@@ -79,9 +79,10 @@ class World:
                 self.barrier()
 
     def check_same(self, facts: dict[str, Any]) -> None:
-        """Refuse processes that were called with different arguments.
+        """Check that all processes were called with the same arguments.
 
-        :raises ValueError: naming what differs; in all of them
+        :param facts: the arguments by name
+        :raises ValueError: in all processes, an argument that differs; the message names it
         """
         everyones: list[Any] = [facts] * self.size
         if self.size > 1:
@@ -132,7 +133,7 @@ _meetings = count()
 def _meeting() -> str:
     """Return a new name for each time that the processes connect.
 
-    Under a name that was used before they would find the addresses of closed connections.
+    Under a name that was used before, they would find the addresses of closed connections.
     """
     restarts = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
     return f"wpt-{restarts}-{next(_meetings)}"

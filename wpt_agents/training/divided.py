@@ -1,7 +1,7 @@
 """Eq. (1) on a batch whose gradients several processes or several passes compute.
 
-Whoever computes a row, its random draws and the clip of its KL are those of the whole batch, so
-that losses and weights are those of one process to rounding.
+The random numbers of a row and the clipping of the KL do not depend on the division of a batch, so
+losses and weights equal those of one process up to rounding.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,9 @@ from wpt_agents.training.world_model_learner import WorldModelLearner
 class Divided:
     """Eq. (1) on batches that are divided over processes, and in each over several passes.
 
-    :param learner: whose world model learns; the copies of all processes become equal
-    :param passes: over each process's share, to save memory
+    :param learner: the learner of the world model; the copies of all processes become equal
+    :param world: the processes that share the work
+    :param passes: number of passes in which each process computes its share, to save memory
     :raises ValueError: a batch that cannot be divided so
     """
 
@@ -50,7 +51,8 @@ class Divided:
         """Add the whole batch's gradients to the weights' gradients and return its losses.
 
         :param share: this process's rows, `World.share` of them
-        :param seed: of the random draws, the same in all processes
+        :param device: the device to compute on
+        :param seed: seed of the random numbers, the same in all processes
         """
         parts = [part.to(device) for part in share.split(self.passes)]
         whole = self._whole_kl(parts, seed)
@@ -80,8 +82,8 @@ class Divided:
     def _whole_kl(self, parts: list[Batch], seed: int) -> Callable[[Tensor], Tensor]:
         """Return a function that turns a part's mean KL into the whole batch's.
 
-        The first of several passes needs to know the KL of all, which costs each part one more way
-        through encoder and RSSM.
+        The first of several passes needs the KL of all parts, for which each part passes through
+        encoder and RSSM once more.
         """
         if self.passes == 1 or self.options["free_nats_mode"] != "mean":
             return self.world.mean
@@ -118,7 +120,7 @@ def part_total(loss: WorldModelLoss, whole_kl: Tensor, free_nats: float) -> Tens
 
     A KL that they clip is a constant and left out.
 
-    :param loss: of the part, without free nats
+    :param loss: the losses of the part, without free nats
     :param whole_kl: the mean KL of the whole batch
     """
     return torch.where(whole_kl < free_nats, loss.reconstruction, loss.total)

@@ -1,4 +1,4 @@
-"""Where an episode ends: the steps after which it does, and its last observation."""
+"""Ends of episodes: the time limit of an environment, and the last observation."""
 
 import math
 import warnings
@@ -63,7 +63,7 @@ def last_observation(
     `final_observation`.
 
     :param first: the first observation after the reset; if both are equal, a warning says so
-    :raises ValueError: the info lacks it
+    :raises ValueError: the info lacks the last observation
     """
     names = ("terminal_observation", "final_obs", "final_observation")
     last = next((infos[i][name] for name in names if infos[i].get(name) is not None), None)

@@ -1,4 +1,4 @@
-"""What an agent accepts as an environment, made into a VecEnv of Stable-Baselines3."""
+"""Convert anything that an agent accepts as an environment to a VecEnv of Stable-Baselines3."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -37,11 +37,11 @@ ACCEPTED = (
 
 
 def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> VecEnv:
-    """Make a VecEnv of any environment; its observations are copies that nobody else writes to.
+    """Make a VecEnv from any environment; its observations are copies.
 
     :param env: an id, a Gymnasium environment, a function that makes one, a list of these, a
         `gymnasium.vector` environment or a VecEnv
-    :param image_key: the entry to see of Dict observations; their only image if None
+    :param image_key: the entry of Dict observations to use; their only image if None
     :param monitor: record each episode's return and length
     """
     if isinstance(env, VectorEnv):
@@ -68,7 +68,7 @@ def as_vec_env(env: Any, image_key: str | None = None, monitor: bool = True) -> 
 
 
 def _extracted(env: VecEnv) -> list[str]:
-    """Return the entries that wrappers take of Dict observations, as in an agent's `get_env()`."""
+    """Return the entries of Dict observations that wrappers select, as in `model.get_env()`."""
     keys = []
     while isinstance(env, VecEnvWrapper):
         keys += [env.key] if isinstance(env, VecExtractDictObs) else []
@@ -154,21 +154,21 @@ OF_WRAPPERS = vars(gym.Wrapper(gym.Env())).keys()  # what Gymnasium's wrappers k
 
 
 class OwnObservation(gym.ObservationWrapper):
-    """Copies each observation, as some environments draw the next one into the same array.
+    """A wrapper that copies observations, as some environments reuse one array for all.
 
-    It also checks images, as a DummyVecEnv writes whatever comes into its array of bytes: floats in
-    [0, 1] would become black, and a grayscale image would fill all three channels.
+    It also checks images, because a DummyVecEnv copies them into its uint8 array without a check:
+    floats in [0, 1] would become black, and a grayscale image would fill all three channels.
     """
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set it where it is defined, so that `set_attr` of a DummyVecEnv has an effect."""
+        """Set an attribute where it is defined, so that `DummyVecEnv.set_attr` has an effect."""
         if name in OF_WRAPPERS:
             super().__setattr__(name, value)
         else:
             self.env.set_wrapper_attr(name, value)
 
     def __getattr__(self, name: str) -> Any:
-        """Find it where it is defined, as code that made a DummyVecEnv looks into its `envs`."""
+        """Find an attribute where it is defined, for code that accesses `DummyVecEnv.envs`."""
         if name == "env" or name.startswith("__"):  # not there yet while a copy is made
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         return getattr(self.env, name)
@@ -185,7 +185,12 @@ class OwnObservation(gym.ObservationWrapper):
 
 
 def check_image(image: Any, space: spaces.Space[Any], name: str) -> None:
-    """Refuse an image that is not what its space says; other observations are not looked at."""
+    """Raise a ValueError for an image that does not match its space.
+
+    :param image: an observation
+    :param space: its space; spaces that are not of images are not checked
+    :param name: what to call the observation in the message
+    """
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return
     array = np.asarray(image)
@@ -221,7 +226,7 @@ def innermost(env: VecEnv | None) -> VecEnv | None:
 
 
 def _image_key(space: spaces.Dict, image_key: str | None) -> str | None:
-    """Return the entry to see, or None if there is none; warn of what is left out."""
+    """Return the entry to use, or None if there is none; warn of entries that are left out."""
     boxes = {key: box for key, box in space.spaces.items() if isinstance(box, spaces.Box)}
     images = image_keys({key: (box.shape, box.dtype) for key, box in boxes.items()})
     if image_key is not None:

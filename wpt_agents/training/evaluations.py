@@ -1,4 +1,4 @@
-"""Callbacks that evaluate on the same entry of Dict observations as the agent sees."""
+"""Let callbacks evaluate on the entry of Dict observations that the agent uses."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 
 
 def evaluators(callback: Any) -> Iterator[EvalCallback]:
-    """Yield the EvalCallbacks of what `learn` takes as callbacks, also those inside of others."""
+    """Yield all EvalCallbacks in the argument `callback` of `learn`, also nested ones."""
     if isinstance(callback, EvalCallback):
         yield callback
     inner = [*getattr(callback, "callbacks", []), getattr(callback, "callback", None)]
@@ -21,12 +21,12 @@ def evaluators(callback: Any) -> Iterator[EvalCallback]:
 
 @contextmanager
 def showing_same_entry(callback: Any, env: VecEnv) -> Iterator[None]:
-    """Wrap the environments of EvalCallbacks as the agent's is, so that both show the same entry.
+    """Wrap the environments of EvalCallbacks like the agent's, for the same observations.
 
     SB3 warns if they differ in type, and copies the averages of VecNormalize wrapper by wrapper.
     At the end, also after an error, the callbacks have their own environments again.
 
-    :param callback: what `learn` takes
+    :param callback: the argument of `learn`
     :param env: the agent's environment
     """
     before: dict[EvalCallback, VecEnv] = {}

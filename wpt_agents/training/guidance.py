@@ -26,8 +26,9 @@ def linear(start: float, end: float, duration: float) -> Schedule:
 def parse_schedule(text: str | float, most: float = 1.0, name: str = "guidance") -> Schedule:
     """Read a schedule: 'linear(1,0,50000)', or a constant.
 
+    :param text: the schedule
     :param most: the largest value allowed: 1 for a probability, infinite for a weight
-    :param name: the keyword that the schedule is of
+    :param name: the name of the keyword, for the message
     :raises ValueError: anything else
     """
     number = r"([-+0-9.eE_]+)"
@@ -53,9 +54,10 @@ def ever(schedule: Schedule) -> bool:
 def draw_window(probability: float, length: int, rng: np.random.Generator) -> tuple[int, int]:
     """Draw the steps k .. k + H - 1 of an episode at which the prior actor acts.
 
-    :param probability: of guiding this episode at all
-    :param length: steps of an episode
-    :return: (k, k + H), half-open; (0, 0) if the episode is not guided
+    :param probability: the probability that the episode is guided
+    :param length: number of steps of an episode
+    :return: (k, k + H), of which the first is included and the second is not; (0, 0) if the episode
+        is not guided
     """
     if rng.random() >= probability:
         return 0, 0

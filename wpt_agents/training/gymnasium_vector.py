@@ -15,7 +15,7 @@ REMEDY = "make it with vector_kwargs={'autoreset_mode': gymnasium.vector.Autores
 
 
 class GymnasiumVecEnv(VecEnv):
-    """Steps a vector environment of Gymnasium, and reports ends of episodes as a VecEnv does.
+    """A Gymnasium vector environment that reports ends of episodes as a VecEnv does.
 
     A VecEnv resets an environment in the step that ends its episode: it returns the first
     observation of the next one, and the last of the old one in the info. Of Gymnasium's autoreset
@@ -98,7 +98,7 @@ class GymnasiumVecEnv(VecEnv):
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all environments; Gymnasium cannot do so for some."""
+        """Set an attribute of all environments, as Gymnasium has no way to select some."""
         self._all_of(indices, "set_attr")
         # Gymnasium would distribute the entries of a list or tuple among the environments.
         values = [value] * self.num_envs
@@ -107,7 +107,7 @@ class GymnasiumVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Call a method of all environments; Gymnasium cannot do so for some."""
+        """Call a method of all environments, as Gymnasium has no way to select some."""
         self._all_of(indices, "env_method")
         return list(self.vector.unwrapped.call(method_name, *args, **kwargs))  # type: ignore
 
@@ -121,11 +121,13 @@ class GymnasiumVecEnv(VecEnv):
 
     def _all_of(self, indices: VecEnvIndices, name: str) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise ValueError(f"{name} of a Gymnasium vector reaches all environments: no indices=")
+            raise ValueError(
+                f"{name} of a Gymnasium vector applies to all environments: leave indices out"
+            )
 
 
 def _autoreset_mode(vector: VectorEnv) -> AutoresetMode:
-    """Return the mode of a vector; refuse those whose first observations come too late."""
+    """Return the autoreset mode; raise a ValueError if first observations come too late."""
     inner, mode = vector.unwrapped, vector.metadata.get("autoreset_mode")
     name = type(inner).__name__
     if mode is None:
@@ -149,7 +151,7 @@ def _at(observations: Any, i: int) -> Any:
 
 
 def _of_one(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Return one environment's info; in Gymnasium's arrays `_key` says who has the `key`."""
+    """Return one environment's info; in Gymnasium's arrays, `_key` marks those with a `key`."""
     one = {}
     for key, values in infos.items():
         is_mask = key.startswith("_") and key[1:] in infos

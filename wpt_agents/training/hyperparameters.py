@@ -199,7 +199,7 @@ class Hyperparameters(Keywords):
         "weight, or a schedule of it, of a loss with which the actor imitates the prior actor on "
         "replayed images; not in the paper. 0: off; if the prior actor is good, try 20. "
         "'adaptive(20,1)' falls from 20 to 1 while the newest episodes return as much as "
-        "those of the warm-up, which the prior actor drove, and rises again while they do not",
+        "those of the warm-up, in which the prior actor acts, and rises again while they do not",
     )
     actor_delay: int = count(
         0,
@@ -405,7 +405,7 @@ class Hyperparameters(Keywords):
 
     @property
     def adapts(self) -> bool:
-        """Whether the weight of the imitation goes by the returns."""
+        """Whether the weight of the imitation loss depends on the returns."""
         return isinstance(parse_kickstart(self.kickstart), Adaptive)
 
     @property
@@ -433,10 +433,12 @@ class Hyperparameters(Keywords):
     def kickstart_at(
         self, step: int, prior: Sequence[float] = (), later: Sequence[float] = ()
     ) -> float:
-        """Return the weight of the imitation loss at this step, after episodes of these returns.
+        """Return the weight of the imitation loss at this step.
 
-        :param prior: of the episodes that the prior actor drove
-        :param later: of the episodes after these
+        :param step: collected steps
+
+        :param prior: returns of the episodes in which the prior actor acted alone
+        :param later: returns of the episodes after these
         """
         weight = parse_kickstart(self.kickstart)
         return weight.weight(prior, later) if isinstance(weight, Adaptive) else weight(step)

@@ -45,7 +45,7 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Keyword:
-    """What is declared of a keyword besides its default.
+    """The declaration of a keyword, except its default.
 
     :param doc: its documentation, without a full stop
     :param stage: when it is used
@@ -63,7 +63,7 @@ def keyword(default: Any, check: Check, doc: str, stage: Stage = Stage.TASK) -> 
 
 
 def must(words: str, allowed: Callable[[Any], bool]) -> Check:
-    """Return a check that says "`name` must be `words`"."""
+    """Return a check whose error is "`name` must be `words`, got ..."."""
 
     def check(name: str, value: Any) -> None:
         if not allowed(value):
@@ -73,12 +73,12 @@ def must(words: str, allowed: Callable[[Any], bool]) -> Check:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether the value is a finite number; True and False are none."""
+    """Return whether the value is a finite number; True and False do not count as numbers."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def count(default: int | None, doc: str, stage: Stage = Stage.TASK, least: int = 1) -> Any:
-    """Declare a keyword that counts something."""
+    """Declare a keyword that is a whole number of at least `least`."""
 
     def allowed(value: Any) -> bool:
         return is_number(value) and isinstance(value, Integral) and int(value) >= least
@@ -131,7 +131,7 @@ def schedule(default: str | float | None, most: float, doc: str, stage: Stage = 
 
 
 def plain(value: Any) -> Any:
-    """Return Python's own number for one of NumPy's, so that a model file can hold it."""
+    """Convert a NumPy number to a Python number, which a model file can store."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -139,7 +139,8 @@ def plain(value: Any) -> Any:
 class Keywords:
     """The keywords of every `PixelAgent`. Subclasses add their own and may change defaults.
 
-    :cvar sizes_own: keywords that are the size's own if None, and the fields of `Size` to read
+    :cvar sizes_own: keywords that take a value of the size if they are None, and the fields of
+        `Size` with these values
     :cvar size_keyword: the keyword that names the size
     """
 
@@ -196,7 +197,7 @@ class Keywords:
 
     @classmethod
     def declared(cls) -> dict[str, Keyword]:
-        """Return the declaration of each keyword by its name."""
+        """Return the declarations of the keywords by name."""
         return {item.name: item.metadata["keyword"] for item in fields(cls)}
 
     @classmethod
@@ -231,18 +232,18 @@ class Keywords:
         return "\n".join(textwrap.fill(line, 96, subsequent_indent="    ") for line in lines)
 
     def value(self, name: str) -> Any:
-        """Return a keyword's value, the size's own where it is None."""
+        """Return a keyword's value, or that of the size if it is None."""
         value = getattr(self, name)
         if value is None and name in self.sizes_own:
             return getattr(find_size(getattr(self, self.size_keyword)), self.sizes_own[name])
         return value
 
     def resolved(self) -> Self:
-        """Return a copy in which the size's own values stand where None stood."""
+        """Return a copy in which the values of the size replace None."""
         return self.changed(**{name: self.value(name) for name in self.sizes_own})
 
     def chosen(self) -> dict[str, Any]:
-        """Return the keywords that differ from their defaults, and all that the size decides."""
+        """Return the keywords that differ from their defaults or depend on the size."""
         chosen = {}
         for item in fields(self):
             value = self.value(item.name)

@@ -1,7 +1,8 @@
-"""Kickstarting: how strongly the actor imitates the prior actor, by the steps or by the returns.
+"""Kickstarting: the weight with which the actor imitates the prior actor.
 
-The paper does not have it. Source: https://arxiv.org/abs/1803.03835; the rule by the returns is
-ours, in the manner of PPO's adaptive KL penalty (https://arxiv.org/abs/1707.06347, section 4).
+The weight depends on the steps or on the returns. Kickstarting is not in the paper. Source:
+https://arxiv.org/abs/1803.03835; the rule for returns is ours, similar to PPO's adaptive KL penalty
+(https://arxiv.org/abs/1707.06347, section 4).
 """
 
 import math
@@ -19,9 +20,9 @@ FACTOR = 0.8  # by which an episode multiplies or divides the weight
 
 @dataclass(frozen=True)
 class Adaptive:
-    """A weight that falls while the collected episodes return as much as the prior actor's.
+    """A weight that falls while collected returns are at least those of the prior actor.
 
-    Where the policy does as well as the prior actor, it may leave it; where it does worse, even if
+    If the policy is as good as the prior actor, it may move away from it. If it is worse, even if
     only because its actions are noisy, it stays close.
 
     :ivar start: the first and largest weight
@@ -34,11 +35,11 @@ class Adaptive:
     def weight(self, prior: Sequence[float], later: Sequence[float]) -> float:
         """Return the weight after these episodes.
 
-        Each of the later ones multiplies it by 0.8 if the mean of the five newest returns then
-        was at least the prior actor's mean, and divides it by 0.8 if not.
+        Each of the later episodes multiplies the weight by 0.8 if the mean of the five newest
+        returns at that time was at least the prior actor's mean, and divides it by 0.8 if not.
 
-        :param prior: returns of the episodes that the prior actor drove; the weight does not
-            change without any
+        :param prior: returns of the episodes in which the prior actor acted alone; without any, the
+            weight does not change
         :param later: returns of the episodes after these, in their order
         """
         weight = self.start
@@ -55,6 +56,7 @@ class Adaptive:
 def parse_kickstart(text: str | float) -> Schedule | Adaptive:
     """Read the keyword `kickstart`: what `parse_schedule` reads, or 'adaptive(20,1)'.
 
+    :param text: the value of the keyword
     :raises ValueError: anything else
     """
     number = r"([-+0-9.eE_]+)"
@@ -69,7 +71,7 @@ def parse_kickstart(text: str | float) -> Schedule | Adaptive:
     except ValueError as error:
         wrong = str(error)
     raise ValueError(
-        f"{wrong}. 'adaptive(start,end)', which goes by the returns, needs start >= end >= 0, for "
+        f"{wrong}. 'adaptive(start,end)', which depends on returns, needs start >= end >= 0, for "
         "example 'adaptive(20,1)'"
     )
 

@@ -1,4 +1,4 @@
-"""// Update Models of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
+"""The updates of Algorithm 1: optimisers and one update of each network, Eq. (1) to (4)."""
 
 from copy import deepcopy
 from functools import partial
@@ -36,7 +36,7 @@ from wpt_agents.training.world_model_learner import Metrics, WorldModelLearner
 
 
 class Worth(NamedTuple):
-    """What dreams are worth: N starts, H steps."""
+    """Rewards, values and returns of imagined trajectories: N starts, H steps."""
 
     reward: Tensor  # (N, H)
     value: Tensor  # (N, H + 1), of the target critic
@@ -56,8 +56,8 @@ class Learner(WorldModelLearner):
     model's, `kickstart` to the actor's, `repval_scale` and `slow_critic_scale` to the critic's. The
     networks that `reward_ensemble`, `continue_head` and `residual` add have losses of their own.
 
-    :param policy: whose networks learn
-    :param hyperparameters: rates, weights and clips
+    :param policy: the networks to train
+    :param hyperparameters: the keywords of `WPT`
     """
 
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
@@ -73,7 +73,7 @@ class Learner(WorldModelLearner):
         return float(self.hyperparameters.value("actor_critic_learning_rate"))
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
-        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        """Use other hyperparameters from now on; the states of the optimisers are kept."""
         super().configure(hyperparameters)
         self.set_actor_critic_rate(1.0)
 
@@ -95,8 +95,9 @@ class Learner(WorldModelLearner):
     def begin_imitator(self) -> None:
         """Make the optimiser of an imitator that was just copied from the actor.
 
-        It takes over the averages of the actor's. With averages of its own, the first steps would
-        be large, and the imitator would differ from the actor without any imagination.
+        The new optimiser copies the state of the actor's. With a state of zeros, its first steps
+        would be large, and the imitator would differ from the actor without any learning in
+        imagination.
         """
         self.add_imitator()
         assert self.imitator_optimizer is not None
@@ -111,11 +112,14 @@ class Learner(WorldModelLearner):
         imitation_weight: float = 0.0,
         head_start: bool = False,
     ) -> Metrics:
-        """Train world model and heads on a batch, actor and critic on dreams from its states.
+        """Train world model and heads on a batch, actor and critic in imagination from its states.
 
-        :param step: collected steps, by which schedules go
-        :param imitation_weight: of the loss by which the actor imitates the prior actor
-        :param head_start: train the actor on nothing but that imitation (`actor_delay`)
+        :param batch: (B, T) sequences
+        :param generator: source of the random numbers
+        :param step: collected steps, on which schedules depend
+        :param imitation_weight: weight of the loss with which the actor imitates the prior actor
+        :param head_start: train the actor on this loss alone (`actor_delay`)
+        :return: scalars by their names in the log
         """
         settings = self.hyperparameters
         has_imitator = settings.residual and self.policy.imitator is not None
@@ -154,12 +158,14 @@ class Learner(WorldModelLearner):
             return policy.prior_actor.act(seen, policy.action_mask)
 
     def imitation_loss(self, actor: Actor, post: Latent, advice: Tensor) -> Tensor:
-        """Kickstarting: how far an actor is from the prior actor on the replayed images.
+        """Return the loss with which an actor imitates the prior actor (kickstarting).
 
-        The paper does not have it. Source: https://arxiv.org/abs/1803.03835
+        It is the mean squared distance of their actions on the replayed images. Not in the paper.
+        Source: https://arxiv.org/abs/1803.03835
 
         :param post: (B, T, ...), the states of the replayed steps
         :param advice: (B (T - 2), A), the prior actor's actions, which need three images
+        :return: scalar
         """
         mask = self.policy.action_mask
         feat = post.feat[:, FRAMES - 1 :].flatten(0, 1)
@@ -167,12 +173,13 @@ class Learner(WorldModelLearner):
             return bc_loss(actor.dist(feat, mask).mode, advice, mask)
 
     def update_imitator(self, post: Latent, advice: Tensor, imitation_weight: float) -> Metrics:
-        """Take a step on the imitation loss of the imitator, with which `residual` compares.
+        """Take a step on the imitation loss of the imitator, the copy of the actor for `residual`.
 
         :param post: (B, T, ...), the states of the replayed steps
         :param advice: (B (T - 2), A), the prior actor's actions
-        :param imitation_weight: of the actor's own imitation. The imitator has the same, so that
-            the two differ by what imagination changes alone; it goes on where the actor's is 0
+        :param imitation_weight: the weight of this loss for the actor. The imitator's is the same,
+            so that the two differ only by what the actor learns in imagination, or 1 if the actor's
+            is 0
         """
         imitator = self.policy.imitator
         optimizer = self.imitator_optimizer
@@ -188,7 +195,7 @@ class Learner(WorldModelLearner):
         """Return the root mean square of what `residual` adds to the prior actor's actions.
 
         :param post: (B, T, ...), the states of the replayed steps
-        :return: scalar, over the embodiment's own entries
+        :return: scalar, over the entries that are not padded
         """
         mask = self.policy.action_mask
         feat = post.feat.flatten(0, 1)
@@ -197,7 +204,7 @@ class Learner(WorldModelLearner):
         return added[:, mask].square().mean().sqrt()
 
     def states_loss(self, post: Latent, advice: Tensor) -> Tensor:
-        """Return the loss by which imitation trains the states, weighted; the actor is fixed.
+        """Return the weighted loss with which imitation trains the states; the actor is fixed.
 
         :param post: (B, T, ...), the states of the replayed steps, with their gradient
         :param advice: (B (T - 2), A), the prior actor's actions
@@ -207,10 +214,11 @@ class Learner(WorldModelLearner):
             return self.hyperparameters.imitation_grad * self.imitation_loss(actor, post, advice)
 
     def replay_value_loss(self, post: Latent, batch: Batch) -> Tensor:
-        """DreamerV3's replay value loss, on the rows whose rewards are known.
+        """Return DreamerV3's replay value loss, on the rows whose rewards are known.
 
-        DreamerV3 bootstraps by the return of a dream from each replayed state. Here dreams start
-        from some of them only (`imagine_starts`), so the target critic's value stands for it.
+        DreamerV3 bootstraps from the imagined return of each replayed state. Here imagination
+        starts from some states only (`imagine_starts`), so the target critic's value replaces this
+        return.
 
         :param post: (B, T, ...), the states of the replayed steps
         """
@@ -236,10 +244,12 @@ class Learner(WorldModelLearner):
     def dream(
         self, post: Latent, rewarded: Batch, generator: Generator, step: int, head_start: bool
     ) -> tuple[Dream, Worth]:
-        """Dream from replayed states, and compute what the dreams are worth.
+        """Imagine from replayed states, and compute rewards, values and returns.
 
         :param post: (B, T, ...), the states of the replayed steps
-        :param rewarded: the batch with the rewards of arriving in them
+        :param rewarded: the batch with the rewards for arriving in these states
+        :param step: collected steps, on which the pessimism depends
+        :param head_start: whether the actor is trained on imitation alone
         """
         index = self.draw_starts(rewarded, generator)
         start = post.flatten_time().pick(index)
@@ -251,10 +261,11 @@ class Learner(WorldModelLearner):
             return dream, self.worth(dream, arrival, step)
 
     def worth(self, dream: Dream, arrival: Tensor, step: int = 0) -> Worth:
-        """Compute what dreams are worth, Eq. (2).
+        """Compute rewards, values and returns of imagined trajectories, Eq. (2).
 
-        :param arrival: (N,), the replayed rewards of arriving in the states that they start from
-        :param step: collected steps, by which the pessimism goes
+        :param dream: the trajectories
+        :param arrival: (N,), the replayed rewards for arriving in the states from which they start
+        :param step: collected steps, on which the pessimism depends
         """
         settings = self.hyperparameters
         reward = self.imagined_reward(dream, arrival, step)
@@ -264,9 +275,10 @@ class Learner(WorldModelLearner):
         return Worth(reward, value, returns, goes_on)
 
     def imagined_reward(self, dream: Dream, arrival: Tensor, step: int) -> Tensor:
-        """Return the rewards of arriving in the imagined states 0 .. H-1, (N, H).
+        """Return the rewards for arriving in the imagined states 0 .. H-1, (N, H).
 
-        :param arrival: of `worth`; the heads predict it, but a subclass may have no such head
+        :param arrival: as in `worth`; the reward heads do not need it, but a subclass without them
+            may
         """
         model = self.policy.world_model
         states = dream.states.but_last()
@@ -277,7 +289,7 @@ class Learner(WorldModelLearner):
             return over_steps(model.reward, states)
 
     def imagined_continue(self, dream: Dream) -> Tensor | None:
-        """Return the probability of going on after the steps 0 .. H-1, (N, H); None if certain."""
+        """Return the probability of continuing after the steps 0 .. H-1, (N, H); None means 1."""
         model = self.policy.world_model
         if model.continue_head is None or not self.hyperparameters.continue_head:
             return None
@@ -285,7 +297,7 @@ class Learner(WorldModelLearner):
             return over_steps(model.goes_on, dream.states.but_last())
 
     def return_scale(self, returns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the running 5-95 % range of the returns, and what they are divided by: scalars.
+        """Return the running 5-95 % range of the returns and the divisor of returns, scalars.
 
         :param returns: (N, H)
         """
@@ -311,8 +323,9 @@ class Learner(WorldModelLearner):
         Without a prior actor to imitate, the actor is not updated during the head start: reward
         head and critic learn first.
 
-        :param scale: what returns are divided by
-        :param imitation: added to the loss, but not to the metric of it
+        :param scale: the divisor of returns
+        :param imitation: the weighted imitation loss, which is added to the loss, but not to its
+            metric
         """
         # In a new context: torch before 2.11 would use the weights again that it has cast in the
         # dream, without gradient for REINFORCE. Source: https://github.com/pytorch/pytorch/pull/165068
@@ -325,10 +338,10 @@ class Learner(WorldModelLearner):
         return {"train/actor_loss": loss.detach(), "train/actor_grad_norm": norm}
 
     def actor_loss(self, dream: Dream, worth: Worth, scale: Tensor, step: int = 0) -> Tensor:
-        """Compute Eq. (4), or DreamerV3's REINFORCE on the actions of the dreams.
+        """Compute Eq. (4), or DreamerV3's REINFORCE loss on the imagined actions.
 
-        :param scale: what returns are divided by
-        :param step: collected steps, by which the weight of the entropy goes
+        :param scale: the divisor of returns
+        :param step: collected steps, on which the weight of the entropy depends
         """
         settings = self.hyperparameters
         reward, value, returns, goes_on = worth
@@ -355,7 +368,8 @@ class Learner(WorldModelLearner):
     ) -> Metrics:
         """Take a step on Eq. (3), and move the target critic.
 
-        :param replay_loss: added to the loss, but not to the metric of it
+        :param replay_loss: the weighted replay value loss, which is added to the loss, but not to
+            its metric
         """
         policy = self.policy
         settings = self.hyperparameters
@@ -375,7 +389,7 @@ class Learner(WorldModelLearner):
 
 
 def dream_metrics(dream: Dream, worth: Worth, scale: Tensor) -> Metrics:
-    """Return the metrics of dreams."""
+    """Return the metrics of imagined trajectories."""
     return {
         "train/value": worth.value.detach().mean(),
         "train/imagined_reward": worth.reward.detach().mean(),

@@ -27,7 +27,7 @@ STEP = "time/pretrain_steps"
 
 
 class ContinuedCSV(CSVOutputFormat):
-    """SB3's `progress.csv`, which goes on with the rows that are there."""
+    """SB3's writer of `progress.csv`, which continues an existing file."""
 
     def __init__(self, path: Path) -> None:
         path.touch()
@@ -39,7 +39,7 @@ class ContinuedCSV(CSVOutputFormat):
         self.file.seek(0, 2)
 
     def keep(self, step: int) -> None:
-        """Drop rows of later updates, which are made again, and a row that was cut short.
+        """Drop the rows of later updates, which are made again, and an incomplete row.
 
         Files of version 0.1 have no column of steps: a row stands for `LOG_EVERY` updates.
         """
@@ -58,7 +58,7 @@ class ContinuedCSV(CSVOutputFormat):
 
 
 class ContinuedTensorBoard(TensorBoardOutputFormat):
-    """SB3's TensorBoard events, of which those behind a step are hidden: they are made again."""
+    """SB3's TensorBoard writer, which hides the events after a step: they are written again."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.writer = SummaryWriter(str(folder), purge_step=step + 1 if step else None)
@@ -66,12 +66,12 @@ class ContinuedTensorBoard(TensorBoardOutputFormat):
 
 
 class PretrainingLog:
-    """Write the means of pre-training's metrics over `LOG_EVERY` updates, and over the last ones.
+    """Write means of the metrics of pre-training over `LOG_EVERY` updates, or the last ones.
 
     :param run_dir: folder of `progress.csv` and, where tensorboard is installed, of its events
     :param tensorboard_log: folder of TensorBoard's runs; this one is named "pretrain_1" and so on
     :param verbose: 1 to print a table, too
-    :param step: updates that were made before
+    :param step: number of updates that were made before
     """
 
     def __init__(

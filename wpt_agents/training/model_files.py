@@ -1,4 +1,4 @@
-"""What an agent's model file holds: keywords, counters, weights and optimisers, without pickle."""
+"""The content of model files: keywords, counters, weights and optimisers, without pickle."""
 
 import os
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def optimizers(learner: object) -> dict[str, Optimizer]:
 
 
 def write(path: ModelPath, header: Mapping[str, Any], policy: BasePolicy, learner: object) -> None:
-    """Write a model file, whole or not at all. The suffix .zip is added where there is none."""
+    """Write a model file, completely or not at all; the suffix .zip is added if there is none."""
     if isinstance(path, str | os.PathLike) and not Path(path).suffix:
         path = Path(path).with_suffix(".zip")
     weights = policy.state_dict()  # of which compiled parts have other names
@@ -34,9 +34,9 @@ def write(path: ModelPath, header: Mapping[str, Any], policy: BasePolicy, learne
 def restore(
     tensors: Mapping[str, Mapping[str, Tensor]], policy: BasePolicy, learner: object
 ) -> None:
-    """Load the weights and the optimisers' averages of a model file. Learning rates stay.
+    """Load the weights and the optimiser states of a model file; learning rates stay.
 
-    Of a file that holds a world model alone, the policy's other networks stay as they are.
+    If the file contains a world model alone, the policy's other networks do not change.
     """
     if WORLD_MODEL in tensors:
         policy.load_state_dict({**policy.state_dict(), **tensors[WORLD_MODEL]})
@@ -62,10 +62,12 @@ def shipped() -> dict[str, Path]:
 
 
 def check_class(header: Mapping[str, Any], path: ModelPath, expected: str) -> None:
-    """Refuse a model file that another agent wrote.
+    """Check that a model file was written by the expected agent.
 
-    :param expected: the name of the agent that wants to read it
-    :raises ValueError: naming the agent that can read it
+    :param header: the header of the file
+    :param path: the file, for the message
+    :param expected: the name of the agent that reads the file
+    :raises ValueError: another agent wrote it; the message names that agent
     """
     kind = header.get("class", expected)
     if kind != expected:
@@ -73,11 +75,12 @@ def check_class(header: Mapping[str, Any], path: ModelPath, expected: str) -> No
 
 
 def check_same(before: Mapping[str, Any], now: Mapping[str, Any], names: tuple[str, ...]) -> None:
-    """Refuse to load weights that were trained with other values of some keywords.
+    """Check that weights were trained with the same values of some keywords.
 
     :param before: the keywords of the model file
-    :param now: those of the agent that loads it
-    :raises ValueError: naming both values
+    :param now: the keywords of the agent that loads the file
+    :param names: the keywords to compare
+    :raises ValueError: a value differs; the message names both
     """
     for name in names:
         if before[name] != now[name]:

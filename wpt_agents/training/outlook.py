@@ -1,4 +1,4 @@
-"""Whether a call of `learn` makes any update, and what to say if it makes none."""
+"""Predict whether a call of `learn` makes any update, and word the warning if it makes none."""
 
 import math
 import warnings
@@ -10,7 +10,7 @@ from wpt_agents.training.ends import time_limit
 
 @dataclass(frozen=True)
 class Outlook:
-    """What decides whether a call of `learn` makes updates.
+    """The numbers that decide whether a call of `learn` makes updates.
 
     Steps are calls of `env.step`, counted once for every environment.
 
@@ -21,13 +21,13 @@ class Outlook:
     :param opened: steps of the longest open episode, in one environment
     :param longest: steps after which an open episode is stored, `max_trajectory_length`
     :param limit: steps of an episode, if they are known
-    :param price: steps that pay for one update; infinitely many where none is expected
-    :param credit: earlier steps that no update has used
+    :param price: collected steps for each update; infinite if no update is expected
+    :param credit: earlier steps for which no update was made
     :param learning_starts: steps before the first update
-    :param warmup_pays: whether the steps before `learning_starts` pay, too
-    :param warmup_steps: steps in which each episode that begins is driven by the guide alone
-    :param cheaper: an assignment by which the call's steps pay for an update, "" for none
-    :param driver: who drives the warm-up
+    :param warmup_pays: whether updates are also made for the steps before `learning_starts`
+    :param warmup_steps: in episodes that begin in these first steps, the guide alone acts
+    :param cheaper: a line of code that makes the call's steps enough for an update, or ""
+    :param driver: what chooses the actions in the warm-up
     """
 
     start: int
@@ -47,7 +47,7 @@ class Outlook:
 
     @classmethod
     def of(cls, agent: Any) -> Self:
-        """Return what decides whether a `PixelAgent` makes updates until `_total_timesteps`."""
+        """Return the numbers of a `PixelAgent` whose `learn` ends at `_total_timesteps`."""
         rollout = agent.rollout
         fresh = rollout is None or agent._last_episode_starts.all()
         n_envs = agent.n_envs
@@ -71,7 +71,8 @@ class Outlook:
     def warn(self, over: bool, learns: bool) -> None:
         """Warn of a call that makes no update, or in which the policy never acts.
 
-        :param learns: whether it has made updates, or need not make any
+        :param over: whether the call is over
+        :param learns: whether the agent has made updates, or need not make any
         """
         if not self.steps:  # nobody expects updates of learn(0)
             return
@@ -87,13 +88,14 @@ class Outlook:
 
     @property
     def paid_from(self) -> int:
-        """The step from which on steps pay for updates."""
+        """The step from which on updates are made for collected steps."""
         return self.start if self.warmup_pays else max(self.start, self.learning_starts)
 
     def first_stored(self, over: bool) -> int:
-        """Return the steps of this call until something can be replayed, as far as one can tell.
+        """Return the steps of this call until something can be replayed, or an estimate.
 
-        :param over: whether the call is over. Until then an episode of unknown length may end soon
+        :param over: whether the call is over; before that, an episode of unknown length may end at
+            any step
         """
         if self.replay:
             return 0
@@ -110,7 +112,7 @@ class Outlook:
         return math.ceil((first - self.start) / self.n_envs) * self.n_envs
 
     def obstacles(self, over: bool) -> dict[str, str]:
-        """Return what stands in the way of the first update, and an assignment that removes it."""
+        """Return the reasons why no update is made, each with a line of code that removes it."""
         obstacles = {}
         affordable = self.credit + self.steps >= self.price - 1e-9
         paid = self.credit + self.stop - self.paid_from >= self.price - 1e-9
@@ -129,7 +131,7 @@ class Outlook:
         return obstacles
 
     def no_update(self, over: bool) -> str | None:
-        """Return what to say if the call makes no update, None if it makes some.
+        """Return the warning if the call makes no update, None if it makes some.
 
         :param over: whether the call is over and has made none
         """
@@ -151,7 +153,7 @@ class Outlook:
         )
 
     def warm_up_only(self) -> str | None:
-        """Return what to say if the policy itself never acts in this call, else None."""
+        """Return the warning if the policy itself never acts in this call, else None."""
         if self.stop > self.warmup_steps:
             return None
         return (

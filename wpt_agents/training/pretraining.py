@@ -1,4 +1,4 @@
-"""// Task-Agnostic World Model Pre-Training of Algorithm 1, on one device or many."""
+"""Pre-training of the world model (Algorithm 1), on one device or several."""
 
 import os
 import warnings
@@ -33,7 +33,7 @@ Callback = Callable[[int, dict[str, float]], Any]  # called with the updates mad
 
 
 class Pretrainable(Protocol):
-    """What an agent must have so that `pretrain` can train its world model."""
+    """An agent whose world model `pretrain` can train."""
 
     @property
     def dataset(self) -> TrajectoryDataset | None:
@@ -45,7 +45,7 @@ class Pretrainable(Protocol):
 
     @property
     def learner(self) -> WorldModelLearner:
-        """What updates the world model."""
+        """The object that updates the world model."""
 
     @property
     def progress(self) -> WorldModelProgress:
@@ -74,9 +74,12 @@ def pretrain(
     """Train a model's world model on its dataset, up to `steps` updates in all.
 
     :param world: the processes that share the work; rank 0 alone writes files and calls back
-    :param accumulate: passes over a batch, or a process's share of it, to save memory
+    :param steps: number of updates in all
+    :param accumulate: number of passes in which a batch, or a process's share of it, is computed,
+        to save memory
     :param run_dir: folder of the model file and of the learning curve
-    :param callback: called after every update
+    :param progress_bar: show a progress bar
+    :param callback: called after every update with (step, metrics)
     """
     assert model.dataset is not None
     facts = {"steps": steps, "accumulate": accumulate}
@@ -94,8 +97,8 @@ class Pretraining:
     """Count, log and save the updates of pre-training, and stop it when asked.
 
     With a run folder the model is saved every `SAVE_EVERY` updates, at the end, and when Ctrl-C,
-    SIGTERM or the callback stops it. It is never saved in the middle of an update, so that
-    training that goes on from there equals training that was never stopped.
+    SIGTERM or the callback stops it. It is never saved in the middle of an update, so that training
+    that continues from the file equals training that was never stopped.
 
     Example::
 
@@ -104,7 +107,7 @@ class Pretraining:
                 run.finish_update(metrics)
 
     :param agent: with `save`, `progress.pretrain_steps`, `tensorboard_log` and `verbose`
-    :param steps: updates in all
+    :param steps: number of updates in all
     :param run_dir: folder of `model.zip` and of the log
     :param callback: called after every update with (step, metrics)
     :param world: the processes that share the work; rank 0 alone logs, saves and calls back
@@ -181,7 +184,7 @@ class Pretraining:
             self.signals.deliver(stop)
 
     def _lock(self) -> None:
-        """Refuse a run folder in which another process trains."""
+        """Lock the run folder; raise a ValueError if another process trains in it."""
         if self.run_dir is None:
             return
         self.run_dir.mkdir(parents=True, exist_ok=True)
@@ -212,8 +215,9 @@ def world_model_updates(
     Batch k depends on the seed and k alone, so that training that is interrupted continues exactly.
 
     :param world: the processes that share the work; a batch is divided among them
-    :param steps: updates in all
-    :param accumulate: passes over a batch, or a process's share of it, to save memory
+    :param steps: number of updates in all
+    :param accumulate: number of passes in which a batch, or a process's share of it, is computed,
+        to save memory
     """
     assert model.dataset is not None
     learner = model.learner
@@ -278,7 +282,7 @@ def divided_update(
 
 
 def common_seed(world: World, seed: int | None) -> int | None:
-    """Return the seed, or if several processes have none, the same new one for all."""
+    """Return the seed, or if several processes have none, one new seed for all."""
     if seed is None and world.size > 1:
         return world.rank_0s(torch_seed(np.random.default_rng()))
     return seed

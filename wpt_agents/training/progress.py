@@ -1,4 +1,4 @@
-"""How far an agent has come: everything that its model file holds besides weights and keywords."""
+"""Counters of agents: the content of a model file besides weights and keywords."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -14,11 +14,11 @@ class Progress:
     A field that is added later needs `field(metadata={"earlier": value})`, the value for model
     files that were written without it.
 
-    :cvar of_weights: counters that belong to the weights, wherever these are loaded
+    :cvar of_weights: counters that are loaded together with the weights
     :ivar num_timesteps: calls of `env.step`, counted once for every environment
     :ivar episodes: episodes that were collected
     :ivar updates: updates that were made for a task
-    :ivar credit: collected steps that no update has used yet
+    :ivar credit: collected steps for which no update was made yet
     :ivar windows_drawn: trajectories for which a guidance window was drawn
     :ivar seen_length: steps of the longest trajectory so far
     :ivar cut: trajectories that were stored before their episode ended
@@ -40,7 +40,7 @@ class Progress:
     def of(cls, saved: Mapping[str, Any]) -> Self:
         """Read the counters of a model file, also of one that version 0.1 wrote.
 
-        :raises ValueError: naming the counters that are missing
+        :raises ValueError: counters are missing; the message names them
         """
         counters = {RENAMED.get(name, name): value for name, value in saved.items()}
         names = {item.name for item in fields(cls)}
@@ -58,16 +58,16 @@ class Progress:
         return asdict(self)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what belongs to the weights, as `get_parameters` of Stable-Baselines3 asks."""
+        """Return the counters of the weights, for `get_parameters` of Stable-Baselines3."""
         return {name: getattr(self, name) for name in self.of_weights}
 
     def load_state_dict(self, state: Mapping[str, Any], strict: bool = True) -> None:
-        """Take over what `state_dict` returns; what is missing stays."""
+        """Load the result of `state_dict`; counters that it lacks do not change."""
         for name in state.keys() & set(self.of_weights):
             setattr(self, name, state[name])
 
     def restart_steps(self) -> None:
-        """Count the steps from 0 again; random numbers go on and do not repeat."""
+        """Count the steps from 0 again, without repeating random numbers."""
         self.earlier_steps += self.num_timesteps
         self.num_timesteps = 0
 
@@ -83,7 +83,7 @@ class WorldModelProgress(Progress):
     """Counters of an agent with WPT's networks.
 
     :ivar pretrain_steps: updates of the world model in pre-training
-    :ivar task_updates: updates for the present task
+    :ivar task_updates: updates for the current task
     :ivar initialised: whether a new world model was adapted to its data
     :ivar cloned: whether the prior actor is trained
     """
@@ -101,7 +101,7 @@ class WPTProgress(WorldModelProgress):
     """Counters of WPT.
 
     :ivar retrieved_ids: numbers of the retrieved trajectories in the dataset
-    :ivar retrieved_of: fingerprint of that dataset
+    :ivar retrieved_of: fingerprint of this dataset
     :ivar adapted: updates of the world model on the retrieved trajectories alone
     """
 

@@ -15,7 +15,7 @@ from torch import Generator, device
 
 
 class Purpose(IntEnum):
-    """What random numbers are drawn for. The values are part of every seed: never reuse one."""
+    """The purposes of random numbers. The values are part of every seed: never reuse one."""
 
     PRETRAIN = 0
     UPDATE = 1

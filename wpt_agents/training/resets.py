@@ -9,7 +9,7 @@ from wpt_agents.training.environments import innermost
 
 
 class CountedReset:
-    """In the place of a VecEnv's method `reset`: counts its calls.
+    """A replacement of a VecEnv's method `reset` that counts its calls.
 
     :param reset: the method
     """
@@ -27,7 +27,7 @@ class CountedReset:
 def resets(env: VecEnv) -> int:
     """Return how often `reset` was called since the first call of this function, by anyone.
 
-    No VecEnv says so itself, and an evaluation may call any of the wrappers.
+    A VecEnv does not count its resets, and an evaluation may call any of the wrappers.
     """
     inner: Any = innermost(env)
     if not isinstance(inner.reset, CountedReset):

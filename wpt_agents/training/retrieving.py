@@ -1,4 +1,4 @@
-"""// Experience Retrieval of Algorithm 1: trajectories that begin most like the task, Eq. (5)."""
+"""Experience retrieval (Algorithm 1): trajectories with first images like the task's, Eq. (5)."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -24,14 +24,14 @@ def retrieve_ids(
     settings: Hyperparameters,
     streams: Streams,
 ) -> list[int]:
-    """Return the numbers of the R trajectories that begin most like the task.
+    """Return the numbers of the R trajectories whose first images are most like the task's.
 
-    Only trajectories with as many actions as the task are retrieved, and if the dataset names the
-    task's robot, only those of this robot or without a name.
+    Only trajectories whose actions have the task's width are retrieved and, if the dataset names
+    the task's robot, only those of this robot or without a name.
 
     :param query: (Q, E), e(o) of the first images of Q episodes of the task
-    :param width: the number of actions
-    :raises ValueError: no trajectory has that many actions
+    :param width: the width of the task's actions
+    :raises ValueError: no trajectory can be retrieved
     """
     names = set(dataset.embodiments)
     # The authors filter by action width alone, which mixes robots: cheetah and walker both have 6.
@@ -62,9 +62,10 @@ def retrieve_ids(
 def with_kept(
     index: Retriever, kept: Sequence[Trajectory], embed: Callable[[np.ndarray], np.ndarray]
 ) -> Retriever:
-    """Return an index of its dataset's trajectories and, behind them, of those in memory.
+    """Return an index of its dataset's trajectories, followed by those in memory.
 
-    :param kept: at least one trajectory
+    :param index: the index of the dataset
+    :param kept: the trajectories in memory, at least one
     :param embed: (n, 64, 64, 3) uint8 -> (n, E) float32, with the encoder of the index
     """
     first = [trajectory.image[0] for trajectory in kept]
@@ -86,14 +87,14 @@ def read_retrieved(
 ) -> Iterator[Trajectory]:
     """Yield retrieved trajectories by the numbers that the index of `with_kept` gives them.
 
-    :param box: the task's actions, in whose units those of the dataset are brought
-    :raises ValueError: trajectories in memory were retrieved and are not there
+    :param box: the task's action space, to whose units the actions of the dataset are converted
+    :raises ValueError: a retrieved trajectory in memory is missing
     """
     stored = len(dataset)
     if max(numbers, default=0) >= stored + len(kept):
         raise ValueError(
-            f"Episodes of earlier tasks were retrieved, and {len(kept)} are there: add them to "
-            "model.kept, or call reset_task()"
+            f"Episodes of earlier tasks were retrieved, but model.kept holds {len(kept)}: set it "
+            "to a ReplayBuffer with all of them, or call reset_task()"
         )
     chosen = dataset.subset([number for number in numbers if number < stored])
     yield from in_units_of(chosen, box)

@@ -1,4 +1,4 @@
-"""Collecting: the open episodes of several environments, and who decides on the actions."""
+"""Collecting: the open episodes of several environments, and the choice between two policies."""
 
 import sys
 import time
@@ -29,7 +29,7 @@ Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A)
 
 
 class Acting(Protocol):
-    """What a policy must be able to do in order to collect. A is the width of its actions."""
+    """The methods that a policy needs for collecting. A is the width of its actions."""
 
     def initial_state(self, n: int) -> State:
         """Return the recurrent state of n new episodes, a tuple of arrays (n, ...)."""
@@ -45,21 +45,21 @@ class Acting(Protocol):
         """Return actions (n, A) in [-1, 1] for images (n, 64, 64, 3), and the next state."""
 
     def executed(self, state: State, action: np.ndarray) -> State:
-        """Return the state after `action` (n, A) was executed, whoever decided on it."""
+        """Return the state after `action` (n, A) was executed, whichever policy chose it."""
 
 
 class Rollout:
-    """Record steps until an episode ends, and let a guide act inside of its window.
+    """Record steps until an episode ends, and let a guide act in its window.
 
     A long episode is recorded as several trajectories, one after the other, so that it can be
     replayed while it goes on. Each has a window of its own; the policy does not notice the cut.
 
-    :param policy: decides on the actions outside of the windows
+    :param policy: the policy that acts outside of the windows
     :param n_envs: number of environments, each with one open episode
     :param action_dim: width of the actions that are recorded, the environment's own
-    :param draw_window: called when a trajectory begins; the steps at which the guide acts
-    :param guide: decides on the actions inside of the windows
-    :param generator: random numbers of the policy
+    :param draw_window: called when a trajectory begins; returns the steps at which the guide acts
+    :param guide: the policy that acts in the windows: (k, F, 64, 64, 3) -> (k, A)
+    :param generator: source of the policy's random numbers
     :param embodiment: name of the robot, written on each trajectory
     """
 
@@ -117,10 +117,10 @@ class Rollout:
         return action
 
     def full(self, done: np.ndarray, longest: int) -> np.ndarray:
-        """Return which open episodes are to be stored so far, (n,) bool.
+        """Return which open episodes have become so long that they must be stored, (n,) bool.
 
-        :param done: (n,) bool, which episodes the present step ended
-        :param longest: steps of a trajectory
+        :param done: (n,) bool, which episodes the current step ended
+        :param longest: the largest number of steps of a trajectory
         """
         lengths = np.array([len(actions) for actions in self.actions])
         full: np.ndarray = (lengths >= longest) & ~done
@@ -133,7 +133,7 @@ class Rollout:
     def end_step(
         self, reward: np.ndarray, done: np.ndarray, last: dict[int, tuple[np.ndarray, bool]]
     ) -> list[Trajectory]:
-        """Record what the step led to; return the trajectories that it completed.
+        """Record the results of a step; return the trajectories that it completed.
 
         :param reward: (n,)
         :param done: (n,) bool, which episodes ended
@@ -173,6 +173,8 @@ def step_all(
 ) -> VecEnvStepReturn:
     """Step every environment once.
 
+    :param env: the n environments
+    :param action: (n, A) in the bounds of their actions
     :param meanwhile: called while worker processes step
     :raises RuntimeError: a worker process died, or did not answer for `PATIENCE` seconds; what was
         learned and recorded is kept

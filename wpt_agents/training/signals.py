@@ -12,7 +12,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignals:
-    """Take note of Ctrl-C and SIGTERM while the block runs; a second one takes effect at once.
+    """Defer Ctrl-C and SIGTERM while the block runs; a second signal takes effect at once.
 
     Example::
 
@@ -40,7 +40,7 @@ class StopSignals:
         return self
 
     def start(self) -> None:
-        """Begin to take note of signals; without effect if it has begun."""
+        """Begin to defer signals; without effect if it has begun already."""
         if self._before or threading.current_thread() is not threading.main_thread():
             return
         for number in SIGNALS:
@@ -64,9 +64,9 @@ class StopSignals:
                 os.write(sys.stderr.fileno(), f"\n{self.message}\n".encode())
 
     def deliver(self, number: int) -> None:
-        """Let a signal do what it would have done without this block.
+        """Let a signal have the effect that it would have had without this block.
 
-        If the process goes on after it, as its own handler may decide, signals are noted again.
+        If the process continues, as its own handler may decide, signals are deferred again.
         """
         self.received = 0
         before = dict(self._before)

@@ -1,4 +1,4 @@
-"""Refuse an environment that an agent cannot see or act in, with a line of code that mends it."""
+"""Checks of an environment's spaces, whose errors contain a line of code that helps."""
 
 import warnings
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ RENDER = (
 
 
 def check_spaces(env: VecEnv, max_action_dim: int | None = None, trained: bool = False) -> None:
-    """Refuse an environment that an agent cannot act in; warn where images will be changed.
+    """Raise a ValueError for spaces that an agent cannot use; warn if images are changed.
 
     :param max_action_dim: the largest number of actions, or None for any
     :param trained: whether a new model with another `max_action_dim` must be trained first
@@ -37,7 +37,7 @@ def check_spaces(env: VecEnv, max_action_dim: int | None = None, trained: bool =
 
 
 def check_observations(env: VecEnv) -> None:
-    """Refuse observations that are no images, naming the wrapper or the conversion to blame."""
+    """Raise a ValueError for observations that are no images, naming a wrapper or the remedy."""
     space = env.observation_space
     if not is_image(space):
         raise ValueError(
@@ -85,7 +85,7 @@ def _layers(env: VecEnv) -> Iterator[Any]:
 
 
 def _culprit(env: VecEnv, channels: int | None = None) -> str | None:
-    """Return the advice to leave out the wrapper that spoils the images, or None if none does."""
+    """Return the advice to leave out the wrapper that changes the images, or None."""
     layers = list(_layers(env))
     for outer, inner in pairwise(layers):
         if is_image(inner.observation_space, channels) and outer.observation_space != (
@@ -170,7 +170,7 @@ def _crop(height: int, width: int, channels: int, channels_last: bool) -> str:
 def check_actions(
     space: spaces.Space[Any], max_action_dim: int | None, trained: bool = False
 ) -> None:
-    """Refuse actions that are no flat Box with finite bounds, or that are too many."""
+    """Raise a ValueError for actions that are no flat, bounded Box, or too many."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(
             f"The agent acts in a one-dimensional Box, the environment takes {space}: "

@@ -26,8 +26,8 @@ Metrics = dict[str, Tensor]  # scalars without gradient, by their names in the l
 class WorldModelLearner:
     """The optimisers of a world model and of its heads, and the updates that they make.
 
-    :param policy: whose world model learns
-    :param hyperparameters: rates, weights and clips
+    :param policy: the policy whose world model is trained
+    :param hyperparameters: the keywords of `WPT`
     """
 
     def __init__(self, policy: WPTPolicy, hyperparameters: Hyperparameters) -> None:
@@ -63,7 +63,7 @@ class WorldModelLearner:
         return descent.adam(parts, rate, self.hyperparameters.weight_decay)
 
     def configure(self, hyperparameters: Hyperparameters) -> None:
-        """Use other hyperparameters from now on; the optimisers keep their averages."""
+        """Use other hyperparameters from now on; the states of the optimisers are kept."""
         self.hyperparameters = hyperparameters.resolved()
         for optimizer in (self.model_optimizer, self.continue_optimizer, self.members_optimizer):
             if optimizer is not None:
@@ -82,11 +82,14 @@ class WorldModelLearner:
         learn_reward: bool = False,
         states_loss: StatesLoss | None = None,
     ) -> tuple[Latent, Batch, Metrics]:
-        """Take a step on Eq. (1), and on the reward likelihood.
+        """Take a step on Eq. (1) and, with `learn_reward`, on the reward likelihood.
 
-        The likelihood trains the reward head and, by the weight `reward_grad`, the states: not at
-        all in the paper (Algorithm 1, r_ξ).
+        The likelihood (Algorithm 1, r_ξ) trains the reward head and, with the weight `reward_grad`,
+        the states; this weight is 0 in the paper.
 
+        :param batch: (B, T) sequences
+        :param generator: source of the random numbers
+        :param learn_reward: whether to train the reward head
         :param states_loss: a further loss, which trains the states
         :return: the posterior states (B, T, ...), without gradient, the batch with the rewards that
             actor and critic learn from, and the metrics

@@ -40,15 +40,18 @@ def test_a_peer_that_is_not_here_is_named_with_the_line_that_installs_it(monkeyp
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["policy", "--peer", "sheeprl"], "--peer goes with bench model, not with bench policy"),
-        (["--peer", "sheeprl"], "not with bench all"),
+        (
+            ["policy", "--peer", "sheeprl"],
+            "--peer is an option of bench model, not of bench policy",
+        ),
+        (["--peer", "sheeprl"], "not of bench all"),
         (["model", "--peer", "sheeprl", "--precision", "bf16"], "--peer measures in fp32"),
         (
             ["policy", "--compile"],
-            "--compile goes with bench model and bench gpu, and not with --peer",
+            "--compile is an option of bench model and bench gpu, without --peer",
         ),
         (["scaling", "--plot", "x.txt"], "--plot x.txt: a picture can be of the types eps, "),
-        (["model", "--plot", "x.png"], "--plot goes with bench scaling, not with bench model"),
+        (["model", "--plot", "x.png"], "--plot is an option of bench scaling, not of bench model"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(arguments, complaint):

@@ -63,7 +63,7 @@ def test_the_actor_of_the_head_start_is_scored_alone_where_the_prior_actor_acts_
     score = trained.evaluate(trained.load("actor"), 3, one.evaluation_seed)
     assert score.returns == pytest.approx(returns["imitating actor"])
     other = replace(trained, method=METHODS["drq-v2"])
-    with pytest.raises(ValueError, match="is not WPT's: its actor always acts alone"):
+    with pytest.raises(ValueError, match="is not of WPT, so its actor always acts alone"):
         other.choose(METHODS["drq-v2"].agent(), "actor")
 
 

@@ -387,9 +387,9 @@ def test_a_model_that_is_too_narrow_for_a_task_is_refused_with_the_setting(tmp_p
         ("wpt", ["collect.behaviour=policy"], "No collect.behaviour 'policy'"),
         ("wpt", ["collect.steps=500"], "collect.steps belongs to collect.behaviour=explore-state"),
         ("kickstart", ["kickstart=5"], "--set kickstart=5 would have no effect"),
-        ("scratch", ["guidance=linear(1,0,9)"], "--method scratch means guidance=0.0"),
-        ("scratch", ["plus.kickstart=5"], "--method scratch means kickstart=0.0"),
-        ("uds", ["rlpd.label=true"], "--method uds means label=zero"),
+        ("scratch", ["guidance=linear(1,0,9)"], "--method scratch sets guidance=0.0"),
+        ("scratch", ["plus.kickstart=5"], "--method scratch sets kickstart=0.0"),
+        ("uds", ["rlpd.label=true"], "--method uds sets label=zero"),
         (
             "wpt",
             ["plus.kickstart=5"],

@@ -80,7 +80,7 @@ def test_all_policies_of_a_run_have_the_same_label(name):
     for line in read(RESULTS / f"{name}.csv"):
         if line.frames:
             labels[line.command, line.commit].add(str(line.preset))
-    assert [found for found in labels.values() if len(found) > 1] == []
+    assert [names for names in labels.values() if len(names) > 1] == []
 
 
 def test_the_learning_curves_have_the_labels_of_their_runs():

@@ -68,7 +68,7 @@ class Episodes(ABC):
 
     @abstractmethod
     def __getitem__(self, i: int) -> Trajectory:
-        """Episode `i`, 0 <= i < len.
+        """Return episode `i`, 0 <= i < len.
 
         :raises ValueError: if it cannot be read or converted; names the file and the remedy
         """
@@ -77,7 +77,7 @@ class Episodes(ABC):
         return (self[i] for i in range(len(self)))
 
     def number(self, i: int) -> int:
-        """The number by which `skip` leaves episode `i` out."""
+        """Return the number by which `skip` leaves episode `i` out."""
         return i
 
     def _trajectory(
@@ -111,7 +111,7 @@ class Episodes(ABC):
             raise ValueError(f"{source}: {error}") from error
 
     def _limits_of(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """The user's limits, one for each dimension of `action`; None if there are none."""
+        """Return the user's limits, one for each dimension of `action`; None if there are none."""
         if self.limits is None:
             return None
         width = action.shape[1]
@@ -142,7 +142,7 @@ class Episodes(ABC):
 class Without(Episodes):
     """The episodes of a source without some of them.
 
-    :param skip: the numbers of those, counted from 0
+    :param skip: the numbers of the episodes to leave out, counted from 0
     :raises ValueError: if there is no episode of such a number
     """
 
@@ -166,7 +166,7 @@ class Without(Episodes):
         return self._episodes[self._kept[i]]
 
     def number(self, i: int) -> int:
-        """The number of episode `i` in the source."""
+        """Return the number of episode `i` in the source."""
         return self._kept[i]
 
 

@@ -17,7 +17,7 @@ GZIP, ZLIB = b"\x1f\x8b", b"\x78\x9c"
 
 
 def find_records(file: Path) -> Iterator[tuple[int, int, bool]]:
-    """Yield the offset and length of each record's data, and if the episode has one step or none.
+    """Yield offset and length of each record's data, and whether it has at most one step.
 
     :raises ValueError: if the file is truncated or compressed
     """

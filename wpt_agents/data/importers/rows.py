@@ -152,7 +152,7 @@ def _flagged(flags: np.ndarray, name: str) -> np.ndarray:
 
 
 def _beginnings(table: Table, columns: Keys, starts: list[int]) -> tuple[bool, bool]:
-    """Return whether the first actions of episodes are all zero or NaN, and if second ones are not.
+    """Return whether all first actions of episodes are zero or NaN, and whether second are not.
 
     :param starts: the first row of each episode
     """

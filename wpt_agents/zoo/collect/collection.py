@@ -218,7 +218,9 @@ def _check(tasks: Sequence[str], episodes: int, behaviour: str, policy: str | No
     if behaviour not in BEHAVIOURS:
         raise unknown_name("behaviour", behaviour, BEHAVIOURS)
     if behaviour == "scripted" and not any(map(has_script, tasks)):
-        raise ValueError("Scripted policies exist for Meta-World's tasks only; use 'noise'.")
+        raise ValueError(
+            "Scripted policies exist for Meta-World's tasks only; use the behaviour 'noise'."
+        )
     if (behaviour == "policy") != (policy is not None):
         raise ValueError(
             "policy=FILE (--policy FILE) belongs to the behaviour 'policy', which needs it."

@@ -122,15 +122,15 @@ def bench(
     Example: `python -m wpt_agents.zoo bench model --json > model.jsonl`
     """
     if peer and case != Case.model:
-        raise ValueError(f"--peer goes with bench model, not with bench {case}")
+        raise ValueError(f"--peer is an option of bench model, not of bench {case}")
     if plot and case != Case.scaling:
-        raise ValueError(f"--plot goes with bench scaling, not with bench {case}")
+        raise ValueError(f"--plot is an option of bench scaling, not of bench {case}")
     if plot:
         _check_picture(plot)
     if compiled and (peer or case not in (Case.model, Case.gpu)):
-        raise ValueError("--compile goes with bench model and bench gpu, and not with --peer")
+        raise ValueError("--compile is an option of bench model and bench gpu, without --peer")
     if probe and case != Case.prediction:
-        raise ValueError(f"--probe goes with bench prediction, not with bench {case}")
+        raise ValueError(f"--probe is an option of bench prediction, not of bench {case}")
     options: dict[str, Any] = {
         "probe": probe,
         "quick": quick,

@@ -40,7 +40,7 @@ def register(app: typer.Typer) -> None:
 
 
 Out = Annotated[
-    Path, typer.Option(help="The folder of the dataset; an unfinished one is continued.")
+    Path, typer.Option(help="The folder of the dataset; an unfinished collection is continued.")
 ]
 Episodes = Annotated[
     int | None,
@@ -57,8 +57,8 @@ Behaviour = Annotated[
 Sigma = Annotated[
     list[float],
     typer.Option(
-        help="Standard deviations of the noise on scripted and saved policies; episodes use them "
-        "in turn."
+        help="Standard deviations of the Gaussian noise on scripted and saved policies; episodes "
+        "use them in turn."
     ),
 ]
 Policy = Annotated[
@@ -80,8 +80,8 @@ Settings = Annotated[
 RenderingOption = Annotated[
     Rendering,
     typer.Option(
-        help="The quality of the images: exact, as the simulator's; near, almost as exact; or "
-        "fast, without shadows. Use the same when you learn the task."
+        help="The quality of the images: exact, as the simulator's; near, nearly the same; or "
+        "fast, without shadows. Learn the task with the same quality."
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="The seed of the episodes.")]

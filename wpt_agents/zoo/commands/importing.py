@@ -67,12 +67,15 @@ Skip = Annotated[
 Low = Annotated[
     str | None,
     typer.Option(
-        help="The lowest value of each action, if not -1, or one value for all: `--low=-2,-2`."
+        help="The lowest value of each action dimension, if not -1, or one value for all: "
+        "`--low=-2,-2`."
     ),
 ]
 High = Annotated[
     str | None,
-    typer.Option(help="The highest value of each action, if not 1, or one for all: `--high=2,2`."),
+    typer.Option(
+        help="The highest value of each action dimension, if not 1, or one for all: `--high=2,2`."
+    ),
 ]
 Trust = Annotated[
     bool,

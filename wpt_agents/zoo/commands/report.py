@@ -38,7 +38,7 @@ def report(
     and CSV files beside it have the numbers of every policy: doing nothing, random, prior actor and
     the agent.
 
-    --record keeps the numbers when the run folders are deleted; a Markdown page and a picture are
+    --record keeps the numbers even if run folders are deleted; a Markdown page and a picture are
     written beside the CSV file, and learning curves into its folder `curves`. If FOLDER has no
     finished run, only these are written again.
     Sequences of tasks are in the page, but not in records.

@@ -52,7 +52,8 @@ def show_retrieval(
     own_robot: Annotated[
         bool,
         typer.Option(
-            "--own-robot", help="Search only the query's robot and number of actions, as WPT does."
+            "--own-robot",
+            help="Search only trajectories of the query's robot and action width, as WPT does.",
         ),
     ] = False,
     out: Picture = Path("retrieval.png"),

@@ -67,7 +67,10 @@ FromNothing = Annotated[
 ]
 DryRun = Annotated[bool, typer.Option(help="Only show what would run.")]
 Watch = Annotated[
-    bool, typer.Option(help="Only show the progress of these runs, started in another terminal.")
+    bool,
+    typer.Option(
+        help="Only show the progress of these runs, which were started in another terminal."
+    ),
 ]
 Engine = Annotated[
     str,
@@ -79,7 +82,10 @@ Engine = Annotated[
 Cpus = Annotated[int, typer.Option(min=1, help="CPU cores to reserve for each run of an engine.")]
 Gpus = Annotated[
     float,
-    typer.Option(min=0, help="GPUs to reserve for each run on Ray and Slurm; with Ray also 0.5."),
+    typer.Option(
+        min=0,
+        help="GPUs to reserve for each run on Ray and Slurm; Ray also accepts shares such as 0.5.",
+    ),
 ]
 Memory = Annotated[
     float, typer.Option(min=0, help="GB of memory to reserve for each run on Ray and Slurm.")
@@ -161,8 +167,8 @@ def pretrain_model(
 ) -> None:
     """Pre-train a world model with the settings of a preset, on its data or yours.
 
-    `run` with the same preset and data reuses the model. Ctrl-C saves it, and the same command
-    continues.
+    `run` with the same preset and data reuses the model. Ctrl-C saves the model, and the same
+    command continues from it.
 
     Example: `python -m wpt_agents.zoo pretrain --preset tiny --set pretrain.steps=2000`
 

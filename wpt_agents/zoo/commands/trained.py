@@ -246,11 +246,11 @@ def probe_latents(
 def push_run(
     run: Annotated[Path, typer.Argument(help="The folder of a finished run.")],
     name: Annotated[
-        str, typer.Argument(help="The repository on the Hugging Face hub: `user/name`.")
+        str, typer.Argument(help="The repository on the Hugging Face Hub: `user/name`.")
     ],
     private: Annotated[bool, typer.Option(help="Make a repository that only you can see.")] = False,
 ) -> None:
-    """Upload a run to the Hugging Face hub: model, configuration, scores, video and a card.
+    """Upload a run to the Hugging Face Hub: model, configuration, scores, video and a card.
 
     Log in first: `hf auth login`.
 
@@ -263,13 +263,13 @@ def push_run(
 
 def pull_run(
     name: Annotated[
-        str, typer.Argument(help="The repository on the Hugging Face hub: `user/name`.")
+        str, typer.Argument(help="The repository on the Hugging Face Hub: `user/name`.")
     ],
     out: Annotated[
         Path | None, typer.Option(help="The folder to write; by default the repository's name.")
     ] = None,
 ) -> None:
-    """Download a run from the Hugging Face hub, for `eval`, `enjoy` and `WPT.load`.
+    """Download a run from the Hugging Face Hub, for `eval`, `enjoy` and `WPT.load`.
 
     Example: `python -m wpt_agents.zoo pull me/drawer --out drawer`
     """

@@ -75,7 +75,9 @@ class Trained:
             return agent
         if policy == "actor":
             if not isinstance(agent, WPT):
-                raise ValueError(f"{self.model} is not WPT's: its actor always acts alone, as wpt")
+                raise ValueError(
+                    f"{self.model} is not of WPT, so its actor always acts alone: use wpt"
+                )
             return actor_alone(agent)
         prior: PolicyPredictor | None = getattr(agent, "prior", None)
         if prior is None:

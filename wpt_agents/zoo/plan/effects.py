@@ -35,7 +35,7 @@ def check_changes(name: str, changes: Sequence[Change]) -> None:
         section, _, keyword = change.key.rpartition(".")
         if section in ("", "plus", *sections(method.agent)) and keyword in method.keywords:
             raise ValueError(
-                f"--method {name} means {keyword}={method.keywords[keyword]}, so --set {change} "
+                f"--method {name} sets {keyword}={method.keywords[keyword]}, so --set {change} "
                 "would have no effect: leave it out, or take another --method"
             )
         if method.shared is not None and change.key in wpt_keywords().keys() - set(method.shared):

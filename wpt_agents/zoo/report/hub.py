@@ -1,4 +1,4 @@
-"""Run folders to and from the Hugging Face hub, with a model card. Needs the extra `hub`."""
+"""Run folders to and from the Hugging Face Hub, with a model card. Needs the extra `hub`."""
 
 import re
 import shutil

@@ -54,7 +54,8 @@ def draw_starts(
     Algorithm 1 starts from all of them, and `number` 0 does so here. Gradients differ little from
     start to start, so a random subset teaches about as much at a fraction of the cost. Every row
     contributes the same number of states (to within one), which keeps the share of retrieved rows.
-    States that have seen fewer than three images are left out, because they know little. This is a
+    The first two states of each row are left out, because they have seen fewer than three images
+    and know little; states behind a joint of short trajectories (`data.windows`) are not. This is a
     deviation from the paper, by the sizes that set `Size.imagine_starts`.
 
     :param number: how many, drawn without replacement; at most those with three images behind them

@@ -245,6 +245,13 @@ def test_an_explorer_learns_and_another_seed_plays_otherwise(kind):
     assert not np.array_equal(played[0].action, next(other.explore(1)).action)
 
 
+def test_two_environments_are_too_many_to_explore():
+    agent = explorer(ICMExplorer)
+    agent.set_env([DotEnv(), DotEnv()])
+    with pytest.raises(ValueError, match="takes one environment, got 2"):
+        next(agent.explore(1))
+
+
 def test_exploring_never_goes_on_with_an_episode_that_learn_left():
     agent = explorer(ICMExplorer)
     agent.learn(30)  # an episode of 25 steps, and 5 of the next

@@ -174,8 +174,14 @@ class Explorer(WPT):
         An episode is a function of the seed and of the replay buffer, so that an explorer that was
         loaded and whose episodes were added continues as if it had never stopped. One that reaches
         `max_trajectory_length` steps ends there.
+
+        :raises ValueError: no environment, or several
         """
-        assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
+        number = 0 if self.env is None else self.n_envs
+        if self.env is None or number != 1:
+            raise ValueError(
+                f"explore takes one environment, got {number}: call set_env(env) with a single one"
+            )
         _, callback = self._setup_learn(
             # no end: `episodes` decides; half, because SB3 adds the steps so far
             sys.maxsize // 2,

@@ -22,6 +22,7 @@ from wpt_agents.agents.curious import (
     ensemble_loss,
     forward_error,
     icm_loss,
+    with_reward,
 )
 from wpt_agents.agents.wpt import WPT
 from wpt_agents.data.trajectory import led_to, stack_windows
@@ -85,6 +86,14 @@ def test_rewards_are_scaled_by_the_running_mean_of_surprise():
     scale.see(torch.tensor([1.0]))
     # means 4 and 1 weigh 0.25 and 0.5: (0.25 * 4 + 0.5 * 1) / 0.75 = 2
     assert scale(torch.tensor(8.0)).item() == pytest.approx(4)
+
+
+def test_curiosity_is_the_reward_of_images_that_follow_another_by_hand():
+    batch = batch_of(recorded(length=3))
+    within = torch.tensor([[True, False, True]])
+    rewarded = with_reward(batch, torch.tensor([[5.0, 6.0, 7.0]]), within)
+    assert rewarded.reward.tolist() == [[0, 5, 0, 7]]
+    assert rewarded.reward_known.tolist() == [[False, True, False, True]]
 
 
 # Surprise falls where data are
@@ -215,7 +224,8 @@ def test_icms_reward_head_learns_the_scaled_surprise_of_each_step():
     [taught] = seen
     within = ~batch.is_first[:, 1:]
     assert (taught.reward_known[:, 1:] == within).all() and not taught.reward_known[:, 0].any()
-    torch.testing.assert_close(taught.reward[:, 1:], surprise / surprise[within].mean())
+    expected = surprise / surprise[within].mean() * within  # 0 where it is unknown
+    torch.testing.assert_close(taught.reward[:, 1:], expected)
     assert batch.reward.abs().sum() == 0  # the caller's batch is unchanged
 
 
@@ -233,6 +243,13 @@ def test_an_explorer_learns_and_another_seed_plays_otherwise(kind):
     assert all((before[k] != after[k]).any() for k in ("actor.layers.0.0.weight",))
     assert any((before[k] != after[k]).any() for k in before if k.startswith("curiosity."))
     assert not np.array_equal(played[0].action, next(other.explore(1)).action)
+
+
+def test_two_environments_are_too_many_to_explore():
+    agent = explorer(ICMExplorer)
+    agent.set_env([DotEnv(), DotEnv()])
+    with pytest.raises(ValueError, match="takes one environment, got 2"):
+        next(agent.explore(1))
 
 
 def test_exploring_never_goes_on_with_an_episode_that_learn_left():

@@ -8,6 +8,7 @@ from debug_agent import SETTINGS, ClockEnv, noise, recorded, same, weights
 
 from wpt_agents import JSRL, MRQ, R3M, RLPD, WPT, DrQv2, PackNet
 from wpt_agents.agents.curious import ICMExplorer, Plan2Explore
+from wpt_agents.training.model_files import optimizers
 
 SMALL = {"seed": 0, "device": "cpu", "batch_size": 4, "learning_starts": 0, "warmup_steps": 0}
 FRAMES = {**SMALL, "channels": 4, "hidden_dim": 8, "update_every": 7, "train_freq": "episode"}
@@ -58,6 +59,19 @@ def test_an_agent_with_anothers_parameters_acts_and_learns_like_it(
         for _ in range(2):
             model.update(defaultdict(list))
     assert one.updates > 2 and same(weights(one), weights(other))
+
+
+@pytest.mark.parametrize(("kind", "keywords"), AGENTS, ids=lambda x: getattr(x, "__name__", ""))
+def test_learning_rates_stay_those_of_the_agents_own_keywords(kind, keywords):
+    policy = next(iter(kind.policy_aliases))
+    one, other = (kind(policy, ClockEnv(), learning_rate=x, **keywords) for x in (1e-3, 3e-3))
+
+    def rates():
+        return {name: x.param_groups[0]["lr"] for name, x in optimizers(other.learner).items()}
+
+    before = rates()
+    other.set_parameters(one.get_parameters())
+    assert rates() == before and 3e-3 in before.values()
 
 
 def test_a_trained_prior_actor_is_kept_and_an_untrained_one_does_not_guide():

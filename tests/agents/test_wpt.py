@@ -721,6 +721,14 @@ def test_an_interrupted_update_costs_none_of_those_that_were_earned(monkeypatch)
     assert (model.updates, model.credit) == (undisturbed.updates, undisturbed.credit)
 
 
+def test_a_callback_after_an_update_sees_that_it_is_paid_for():
+    model = agent(DotEnv(), train_ratio=1)
+    credits = []
+    model.after_update = lambda: credits.append(model.credit)
+    model.learn(LENGTH)
+    assert credits == [17, 9, 1]  # of 25 collected steps each of the three updates takes 2 x 4
+
+
 def test_an_interrupted_clone_begins_anew_from_where_it_began(store, monkeypatch):
     undisturbed = pretrained(store, env=DotEnv(), bc_steps=3).learn(1)
     model = pretrained(store, env=DotEnv(), bc_steps=3)

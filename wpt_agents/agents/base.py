@@ -300,9 +300,9 @@ class PixelAgent(SavedAgent):
         metrics: MetricLists = defaultdict(list)
         for left in reversed(range(updates)):
             self.update(metrics)
+            self.credit = rest + left * price  # so that an interruption costs no updates
             if self.after_update is not None:
                 self.after_update()
-            self.credit = rest + left * price  # so that an interruption costs no updates
         for key, values in metrics.items():
             self.logger.record_mean(key, torch.stack(values).mean().item())
 

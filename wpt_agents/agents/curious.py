@@ -52,6 +52,19 @@ EXPLORE: Mapping[str, Any] = {
 }
 
 
+def with_reward(batch: Batch, curiosity: Tensor, within: Tensor) -> Batch:
+    """Return a batch (B, T) whose rewards are curiosity; those of first images are unknown.
+
+    :param curiosity: (B, T - 1), about the images 1 .. T - 1
+    :param within: (B, T - 1) bool, False where the image before is of another episode
+    """
+    reward = torch.zeros_like(batch.reward)
+    known = torch.zeros_like(batch.is_first)
+    reward[:, 1:] = curiosity * within
+    known[:, 1:] = within
+    return replace(batch, reward=reward, reward_known=known)
+
+
 class CuriousLearner(Learner):
     """A learner whose reward is curiosity; `policy.curiosity` is one more network to train."""
 
@@ -87,11 +100,7 @@ class ICMLearner(CuriousLearner):
         self.descend(self.curiosity_optimizer, loss, "curiosity")
         # seen first, so that the reward is in units that include this batch
         icm.scale.see(surprise[within])
-        reward = torch.zeros_like(batch.reward)
-        known = torch.zeros_like(batch.is_first)
-        reward[:, 1:] = icm.scale(surprise.detach())
-        known[:, 1:] = within
-        batch = replace(batch, reward=reward, reward_known=known)
+        batch = with_reward(batch, icm.scale(surprise.detach()), within)
         post, rewarded, metrics = super().update_world_model(
             batch, generator, learn_reward, states_loss
         )
@@ -126,11 +135,7 @@ class Plan2ExploreLearner(CuriousLearner):
         self.descend(self.curiosity_optimizer, loss, "curiosity")
         surprise = disagreement(prediction.detach())  # the reward must not train the ensemble
         ensemble.scale.see(surprise[within])
-        reward = torch.zeros_like(batch.reward)
-        known = torch.zeros_like(batch.is_first)
-        reward[:, 1:] = ensemble.scale(surprise) * within
-        known[:, 1:] = within
-        rewarded = replace(batch, reward=reward, reward_known=known)
+        rewarded = with_reward(batch, ensemble.scale(surprise), within)
         return post, rewarded, metrics | {"explore/surprise": surprise[within].mean()}
 
     def imagined_reward(self, dream: Dream, arrival: Tensor, step: int) -> Tensor:
@@ -172,8 +177,13 @@ class Explorer(WPT):
 
         :param episodes: the number of episodes in all, including those in the replay buffer
         :return: the episodes with the environment's rewards
+        :raises ValueError: no environment, or several
         """
-        assert self.env is not None and self.n_envs == 1, "explore one environment at a time"
+        number = 0 if self.env is None else self.n_envs
+        if self.env is None or number != 1:
+            raise ValueError(
+                f"explore takes one environment, got {number}: call set_env(env) with a single one"
+            )
         _, callback = self._setup_learn(
             # no end: `episodes` decides; half, because SB3 adds the steps so far
             sys.maxsize // 2,

@@ -156,7 +156,7 @@ class SavedAgent(ConfiguredAgent):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """Load weights and optimisers in place; counters, such as `num_timesteps`, stay.
+        """Load weights and optimisers in place; counters and keywords stay, also learning rates.
 
         :param load_path_or_dict: a model file, or what `get_parameters` returns
         :param exact_match: refuse a dictionary that lacks parts of the agent or has others
@@ -169,6 +169,7 @@ class SavedAgent(ConfiguredAgent):
             # Dictionaries of earlier versions lack "progress".
             parameters = {"progress": {}, **deepcopy(load_path_or_dict)}
             super().set_parameters(parameters, exact_match, device)
+            self.hyperparameters_changed()  # the optimisers have taken over the dictionary's rates
             return
         header, tensors = read_model(model_files.find(load_path_or_dict))
         self._check_same(header, tensors, self.shape_keywords)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.windows import draw_places
 
 
 @dataclass(frozen=True)
@@ -150,10 +151,7 @@ def draw_transitions(
     numbers = [
         len(t) if tails and t.terminated else max(len(t) - n_steps, 0) + 1 for t in trajectories
     ]
-    starts = np.cumsum(numbers)
-    drawn = rng.integers(starts[-1], size=size)
-    chosen = np.searchsorted(starts, drawn, side="right")
-    begin = drawn - np.concatenate([[0], starts])[chosen]
+    chosen, begin = draw_places(np.cumsum(numbers), size, rng)
     shown = [t.image for t in trajectories] if seen is None else seen
     # both ends of a transition in one array, which is filled row by row
     image = np.empty((2, size, frames, *shown[0].shape[1:]), shown[0].dtype)
@@ -197,10 +195,8 @@ def draw_steps(
     """
     if not trajectories:
         raise ValueError("There are no episodes to draw steps from; collect some first")
-    starts = np.cumsum([len(trajectory) for trajectory in trajectories])
-    drawn = rng.integers(starts[-1], size=size)
-    chosen = np.searchsorted(starts, drawn, side="right")
-    begin = drawn - np.concatenate([[0], starts])[chosen]
+    ends = np.cumsum([len(trajectory) for trajectory in trajectories])
+    chosen, begin = draw_places(ends, size, rng)
     shape = trajectories[0].image.shape[1:]
     images = np.empty((size, horizon + 1, frames, *shape), np.uint8)
     action = np.zeros((size, horizon, action_dim), np.float32)

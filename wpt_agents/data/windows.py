@@ -18,6 +18,19 @@ Piece = tuple[int, int, int]  # trajectory, its first image, one past its last i
 Row = list[Piece]  # the pieces that make one sequence
 
 
+def draw_places(
+    ends: np.ndarray, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw n places in trajectories; all places of all trajectories are equally likely.
+
+    :param ends: (N,) int, the cumulative number of places in the trajectories
+    :return: the number of each trajectory and the place in it, (n,) each
+    """
+    draws = rng.integers(ends[-1], size=n)
+    chosen = np.searchsorted(ends, draws, side="right")
+    return chosen, draws - np.concatenate([[0], ends])[chosen]
+
+
 class Windows:
     """Draws sequences from trajectories of known lengths.
 
@@ -38,10 +51,8 @@ class Windows:
             # a short trajectory counts as one window
             ends = np.cumsum(np.maximum(self._images - length + 1, 1))
             self._ends = length, ends
-        draws = rng.integers(ends[-1], size=batch_size)
         # One draw over all windows, so that long trajectories are seen more often than short ones.
-        chosen = np.searchsorted(ends, draws, side="right")
-        starts = draws - np.concatenate([[0], ends])[chosen]
+        chosen, starts = draw_places(ends, batch_size, rng)
         return [
             self._chain(int(i), int(start), length, rng)
             for i, start in zip(chosen, starts, strict=True)

@@ -56,7 +56,7 @@ def draw_starts(
     similar, so a random subset teaches about as much at a fraction of the cost. Every row
     contributes the same number of states (to within one), so that the share of retrieved rows is
     kept. The states of a row's first two images are left out, because they contain little
-    information.
+    information; those at the beginning of a further trajectory in a row (`data.windows`) are not.
 
     :param batch_size: B
     :param length: T

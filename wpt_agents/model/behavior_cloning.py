@@ -8,6 +8,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import one_hot
 
 from wpt_agents.data.trajectory import Trajectory
+from wpt_agents.data.windows import draw_places
 from wpt_agents.model.images import Encoder
 from wpt_agents.model.layers import Linear, LinearNorm
 from wpt_agents.model.ops import op
@@ -85,9 +86,7 @@ def draw_pairs(
         the indices of the trajectories, (n,)
     """
     ends = np.cumsum([len(trajectory) for trajectory in trajectories])
-    draws = rng.integers(ends[-1], size=n)
-    chosen = np.searchsorted(ends, draws, side="right")
-    steps = draws - np.concatenate([[0], ends])[chosen]
+    chosen, steps = draw_places(ends, n, rng)
     times = np.maximum(steps[:, None] + np.arange(1 - FRAMES, 1), 0)
     image = np.stack([trajectories[i].image[t] for i, t in zip(chosen, times, strict=True)])
     action = np.zeros((n, action_dim), np.float32)

@@ -169,7 +169,6 @@ def test_a_resumed_run_of_all_keywords_equals_one_that_was_never_interrupted(sto
         "actor_critic_decay": False,  # which goes by the steps of the call of `learn`
         "guidance": "linear(1,0,60)",
         "recent_share": 0.5,
-        "deterministic_share": 0.4,
         "max_trajectory_length": 5,
         "warmup_steps": 14,
         "train_ratio": 2,

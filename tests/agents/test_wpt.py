@@ -37,13 +37,7 @@ from wpt_agents.training import cloning, pretraining
 from wpt_agents.training.kickstarting import Adaptive
 from wpt_agents.training.learner import Learner
 from wpt_agents.training.randomness import Purpose
-from wpt_agents.training.rollout import (
-    FROM_LATER,
-    FROM_WARM_UP,
-    NO_NOISE,
-    WITHOUT_NOISE,
-    Rollout,
-)
+from wpt_agents.training.rollout import Rollout
 
 
 @pytest.fixture
@@ -1093,49 +1087,6 @@ def test_of_several_environments_each_episode_counts_by_who_acted_in_it(store):
     model = pretrained(store, env=venv, **settings).learn(2 * 30)
     # At step 14 (7 of each) the warm-up goes on, at step 28 it is over; 465 began in it.
     assert model.collected_returns() == ([28, 28, 465], [28, 28])
-
-
-def test_a_share_of_the_episodes_is_collected_as_the_policy_is_evaluated(store):
-    settings = {"warmup_steps": LENGTH, "train_ratio": 0, "deterministic_share": 0.5, "guidance": 1}
-    model = pretrained(store, env=DotEnv(), **settings).learn(5 * LENGTH)
-    episodes = model.replay_buffer.trajectories
-    assert [episode.source for episode in episodes] == [
-        FROM_WARM_UP,
-        *(FROM_LATER, WITHOUT_NOISE, FROM_LATER, WITHOUT_NOISE),
-    ]
-    for episode, without_noise in zip(episodes[1:], (False, True, False, True), strict=True):
-        state, decided = None, []
-        for image in episode.image[:-1]:
-            action, state = model.predict(image, state, deterministic=True)
-            decided.append(action)
-        assert np.allclose(decided, episode.action, atol=1e-6) == without_noise
-
-
-def test_noise_is_left_out_in_the_environments_that_say_so_alone():
-    policy, other = (agent(DotEnv(), seed=1).policy for _ in range(2))
-    draws, same_draws = (torch.Generator().manual_seed(0) for _ in range(2))
-    windows = iter([NO_NOISE, (0, 0)])
-    rollout = Rollout(policy, 2, 2, windows.__next__, by_nobody, draws)
-    noisy = calm = other.initial_state(2)
-    for t, images in enumerate(noise(3, 2)):
-        first = np.full(2, t == 0)
-        action = rollout.act(images)
-        rollout.end_step(np.zeros(2), np.zeros(2, bool), {})
-        with_noise, noisy = other.act(images, noisy, first, generator=same_draws)
-        without, calm = other.act(images, calm, first, deterministic=True)
-        np.testing.assert_allclose(action, [without[0], with_noise[1]], atol=1e-6)
-        assert not np.allclose(with_noise, without, atol=1e-3)
-
-
-def by_nobody(frames):
-    raise AssertionError("no window has a step")
-
-
-def test_only_episodes_without_noise_count_for_the_adaptive_weight(store):
-    settings = {"kickstart": "adaptive(20,1)", "deterministic_share": 0.5, "warmup_steps": LENGTH}
-    model = pretrained(store, env=DotEnv(), **settings).learn(5 * LENGTH)
-    warm_up, _, second, _, fourth = returns_of(model)
-    assert model.collected_returns() == ([warm_up], [second, fourth])
 
 
 def test_replay_buffers_without_sources_are_told_apart_by_the_steps_before(store, tmp_path):

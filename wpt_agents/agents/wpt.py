@@ -37,13 +37,7 @@ from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
 from wpt_agents.training.retrieving import read_retrieved, retrieve_ids, with_kept
-from wpt_agents.training.rollout import (
-    FROM_LATER,
-    FROM_WARM_UP,
-    NO_NOISE,
-    WITHOUT_NOISE,
-    Window,
-)
+from wpt_agents.training.rollout import FROM_LATER, FROM_WARM_UP, Window
 
 NO_DATASET = (
     "No dataset: nothing is rehearsed, there is no prior actor to guide or to imitate, and "
@@ -273,10 +267,6 @@ class WPT(WorldModelAgent, progress=WPTProgress):
 
     def guidance_window(self, rng: np.random.Generator) -> Window:
         """Return the steps of a new episode at which the prior actor acts."""
-        share = self.hyperparameters.deterministic_share
-        number = self.progress.windows_drawn  # of this episode, among those after the warm-up
-        if int(number * share) > int((number - 1) * share):
-            return NO_NOISE
         guided = self.hyperparameters.guidance_at(self.num_timesteps)
         return draw_window(guided if self.progress.cloned else 0.0, self.expected_length(), rng)
 
@@ -366,14 +356,12 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         :return: the returns of the warm-up, and the later ones, in the order of collection
         """
         returns: tuple[list[float], list[float]] = ([], [])
-        without_noise = self.hyperparameters.deterministic_share > 0
         start = 0  # the number of steps that were stored before a trajectory
         for trajectory in self.replay_buffer.trajectories:
             later = start >= self.hyperparameters.value("warmup_steps")
-            if trajectory.source in (FROM_WARM_UP, FROM_LATER, WITHOUT_NOISE):
-                later = trajectory.source != FROM_WARM_UP
-            noisy = later and trajectory.source != WITHOUT_NOISE
-            if trajectory.reward is not None and not (noisy and without_noise):
+            if trajectory.source in (FROM_WARM_UP, FROM_LATER):
+                later = trajectory.source == FROM_LATER
+            if trajectory.reward is not None:
                 returns[later].append(float(trajectory.reward.sum()))
             start += len(trajectory)
         return returns

@@ -201,12 +201,6 @@ class Hyperparameters(Keywords):
         "'adaptive(20,1)' falls from 20 to 1 while the newest episodes return as much as "
         "those of the warm-up, in which the prior actor acts, and rises again while they do not",
     )
-    deterministic_share: float = share(
-        0.0,
-        "share of the episodes after the warm-up in which the policy acts without noise and without "
-        "guidance, as it is evaluated; with an adaptive `kickstart`, only their returns count. Not "
-        "in the paper",
-    )
     actor_delay: int = count(
         0,
         "number of updates of a head start, in which reward head and critic learn while the actor "

@@ -22,12 +22,9 @@ GO_ON = (
 )
 Window = tuple[int, int]  # steps start .. stop - 1 of an episode
 WARM_UP: Window = 0, sys.maxsize  # the whole episode, however long it lasts
-NO_NOISE: Window = -1, -1  # no step: the policy acts alone, deterministically
 # `Trajectory.source` of collected trajectories: whether they began in the warm-up
 FROM_WARM_UP = "collected in the warm-up"
 FROM_LATER = "collected after the warm-up"
-WITHOUT_NOISE = "collected after the warm-up, without noise"
-SOURCES = {WARM_UP: FROM_WARM_UP, NO_NOISE: WITHOUT_NOISE}  # by the window
 Guide = Callable[[np.ndarray], np.ndarray]  # (k, F, 64, 64, 3) frames -> (k, A) actions
 
 
@@ -104,7 +101,9 @@ class Rollout:
             self.opening[i] = image[i].copy()
         # Kept at every step, because the guide's window may begin at any.
         self.frames = stack_frames(image, self.frames, self.episode_start)
-        action, state = self._decide(image)
+        action, state = self.policy.act(
+            image, self.state, self.episode_start, generator=self.generator
+        )
         time = np.array([len(actions) for actions in self.actions])
         start, stop = np.array(self.windows).T
         guided = (start <= time) & (time < stop)
@@ -116,20 +115,6 @@ class Rollout:
             self.images[i].append(frame.copy())  # the environment may draw into it
             self.actions[i].append(row[: self.action_dim].copy())
         return action
-
-    def _decide(self, image: np.ndarray) -> tuple[np.ndarray, State]:
-        """Return the policy's actions (n, A) and the next state; without noise where it says so."""
-        quiet = np.array([window == NO_NOISE for window in self.windows])
-        inputs = image, self.state, self.episode_start
-        if quiet.all():
-            return self.policy.act(*inputs, deterministic=True)
-        action, state = self.policy.act(*inputs, generator=self.generator)
-        if quiet.any():
-            calm, calm_state = self.policy.act(*inputs, deterministic=True)
-            action[quiet] = calm[quiet]
-            for part, calm_part in zip(state, calm_state, strict=True):
-                part[quiet] = calm_part[quiet]
-        return action, state
 
     def full(self, done: np.ndarray, longest: int) -> np.ndarray:
         """Return which open episodes have become so long that they must be stored, (n,) bool.
@@ -175,7 +160,7 @@ class Rollout:
             np.array(self.rewards[i], np.float32),
             terminated,
             embodiment=self.embodiment,
-            source=SOURCES.get(self.windows[i], FROM_LATER),
+            source=FROM_WARM_UP if self.windows[i] == WARM_UP else FROM_LATER,
         )
         self.images[i] = []
         self.actions[i] = []

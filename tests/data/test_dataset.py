@@ -468,7 +468,7 @@ def test_a_newer_version_is_refused_politely(tmp_path):
     made(tmp_path, chain(3))
     meta = json.loads((tmp_path / "meta.json").read_text())
     (tmp_path / "meta.json").write_text(json.dumps({**meta, "version": 99}))
-    with pytest.raises(ValueError, match="version 99, this program reads up to 1; upgrade"):
+    with pytest.raises(ValueError, match="version 99, this program reads up to 1; update"):
         TrajectoryDataset.open(tmp_path)
 
 

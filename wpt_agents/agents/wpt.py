@@ -12,6 +12,7 @@ import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,6 +34,7 @@ from wpt_agents.training import pretraining
 from wpt_agents.training.cloning import Cloning, clone
 from wpt_agents.training.distributed import joined, local_device
 from wpt_agents.training.guidance import draw_window
+from wpt_agents.training.imitating import STEPS_PER_BATCH, imitate
 from wpt_agents.training.keywords import Stage
 from wpt_agents.training.progress import WPTProgress
 from wpt_agents.training.randomness import Purpose
@@ -299,7 +301,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         """Make one update of every network on a mixed batch; append to `metrics`."""
         progress = self.progress
         self.prepare_update()
-        batch = self.mixed_batch()
+        batch = self.mixed_batch(self.streams.numpy(Purpose.UPDATE, progress.updates))
         generator = self.streams.torch(Purpose.UPDATE, progress.updates, self.device)
         with self.operations():
             update = self.learner.update(
@@ -310,6 +312,26 @@ class WPT(WorldModelAgent, progress=WPTProgress):
         self.policy.average(self.averaging())
         progress.updates += 1
         progress.task_updates += 1
+        if not self.head_start:
+            self.imitate(metrics)
+
+    def imitate(self, metrics: MetricLists) -> None:
+        """Let the actor imitate the prior actor from fixed latent states, once for a task."""
+        settings = self.hyperparameters
+        steps = settings.imitation_steps
+        if self.progress.imitated or not self.progress.cloned or not steps:
+            return
+        rngs = (
+            self.streams.numpy(Purpose.IMITATE, k) for k in range(ceil(steps / STEPS_PER_BATCH))
+        )
+        batches = (self.mixed_batch(rng) for rng in rngs)
+        size = settings.batch_size * settings.batch_length
+        with self.operations():
+            actor, loss = imitate(self.learner, batches, steps, size, self.streams)
+        self.policy.actor.load_state_dict(actor.state_dict())
+        self.policy.updates += 1
+        self.progress.imitated = True
+        metrics["train/imitation_loss"].append(loss)
 
     def prepare_update(self) -> None:
         """Adapt a new world model, add networks that are now needed, and set learning rates."""
@@ -323,8 +345,8 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             left = 1 - self.num_timesteps / max(self._total_timesteps, 1)
             self.learner.set_actor_critic_rate(max(left, 0.0))
 
-    def mixed_batch(self) -> Batch:
-        """Draw the batch of the next update: collected sequences, then retrieved ones."""
+    def mixed_batch(self, rng: np.random.Generator) -> Batch:
+        """Draw the batch of an update: collected sequences, then retrieved ones."""
         settings = self.hyperparameters
         return mix(
             self.replay_buffer,
@@ -333,7 +355,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             settings.batch_size,
             settings.batch_length,
             settings.max_action_dim,
-            self.streams.numpy(Purpose.UPDATE, self.progress.updates),
+            rng,
             settings.recent_share,
             settings.marks,
         ).to(self.device)
@@ -412,7 +434,7 @@ class WPT(WorldModelAgent, progress=WPTProgress):
             for trajectory in self.replay_buffer.trajectories:
                 self.kept.add(replace(trajectory, reward=None))
         self.retrieved = None
-        self.progress.reset("retrieved_ids", "adapted")
+        self.progress.reset("retrieved_ids", "adapted", "imitated")
         super().reset_task()
 
     def next_task(self, env: GymEnv | str) -> None:

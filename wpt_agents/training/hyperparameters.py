@@ -208,6 +208,12 @@ class Hyperparameters(Keywords):
         "`train_ratio` allows fewer. Not in the paper",
         least=0,
     )
+    imitation_steps: int = count(
+        0,
+        "number of updates with which the actor imitates the prior actor after the head start, while "
+        "the world model does not change. They take milliseconds each. Not in the paper",
+        least=0,
+    )
 
     actor_grad: str = choice(
         "dynamics",
@@ -379,6 +385,7 @@ class Hyperparameters(Keywords):
             "kickstart": self.imitates,
             "residual": self.residual,
             "actor_delay": self.actor_delay and self.needs_clone,
+            "imitation_steps": self.imitation_steps and self.needs_clone,
         }
         name = next((name for name, on in imitating.items() if on), None)
         if name is not None and self.batch_length < FRAMES:

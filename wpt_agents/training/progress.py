@@ -103,10 +103,12 @@ class WPTProgress(WorldModelProgress):
     :ivar retrieved_ids: numbers of the retrieved trajectories in the dataset
     :ivar retrieved_of: fingerprint of this dataset
     :ivar adapted: updates of the world model on the retrieved trajectories alone
+    :ivar imitated: whether the actor has imitated the prior actor from fixed latent states
     """
 
-    of_weights: ClassVar[tuple[str, ...]] = (*WorldModelProgress.of_weights, "adapted")
+    of_weights: ClassVar[tuple[str, ...]] = (*WorldModelProgress.of_weights, "adapted", "imitated")
 
     retrieved_ids: list[int] = field(default_factory=list)
     retrieved_of: str = ""
     adapted: int = field(default=0, metadata={"earlier": 0})
+    imitated: bool = field(default=False, metadata={"earlier": False})

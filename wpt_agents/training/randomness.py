@@ -29,6 +29,7 @@ class Purpose(IntEnum):
     CONTINUE = 9  # the continue head
     ENSEMBLE = 10  # the further reward heads
     ADAPT = 11  # of the world model to the retrieved trajectories
+    IMITATE = 12  # the prior actor, from fixed latent states
     RESET = 100  # of the environment, before an explorer's episode
 
 

@@ -210,8 +210,8 @@ class Hyperparameters(Keywords):
     )
     imitation_steps: int = count(
         0,
-        "number of updates with which the actor imitates the prior actor after the head start, while "
-        "the world model does not change. They take milliseconds each. Not in the paper",
+        "number of updates with which the actor imitates the prior actor after the head start, "
+        "while the world model does not change. They take milliseconds each. Not in the paper",
         least=0,
     )
 

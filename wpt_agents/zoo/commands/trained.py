@@ -217,9 +217,11 @@ def probe_latents(
     episodes: Annotated[
         int,
         typer.Option(
-            min=2, help="The number of episodes of each task: half to fit on, half to test on."
+            min=2,
+            help="The number of episodes of each task: half to fit on, half to test on. With few, "
+            "positions that change only from episode to episode seem to be missing.",
         ),
-    ] = 10,
+    ] = 40,
     seed: Annotated[int, typer.Option(min=0, help="The seed of the episodes.")] = 1000,
     rendering: Annotated[Rendering, typer.Option(help="The quality of the images.")] = (
         Rendering.fast

@@ -1,7 +1,7 @@
 """Let the actor imitate the prior actor from fixed latent states (`imitation_steps`).
 
 In the head start every update of the actor follows one of the world model, which takes far longer.
-This stage leaves the world model as it is, computes the latent states of some batches once, and
+This stage does not change the world model, computes the latent states of some batches once, and
 makes many short updates of the actor on them. Not in the paper.
 """
 

@@ -38,11 +38,11 @@ def test_the_states_are_those_of_images_that_the_prior_actor_can_see(store):
     feats, advice = states_and_advice(model.learner, batches, model.streams)
     rows, length = batches[0].is_first.shape
     assert len(feats) == len(advice) == 3 * rows * (length - FRAMES + 1)
-    frames = batches[1].image[0, :FRAMES]  # of a window that does not begin an episode inside
-    if not batches[1].is_first[0, 1:FRAMES].any():
-        expected = model.policy.prior_actor.act(frames[None], model.policy.action_mask)
-        number = rows * (length - FRAMES + 1)
-        torch.testing.assert_close(advice[number], expected[0], atol=1e-5, rtol=0)
+    frames = batches[1].image[0, :FRAMES]
+    assert not batches[1].is_first[0, 1:FRAMES].any()  # they are of one episode
+    expected = model.policy.prior_actor.act(frames[None], model.policy.action_mask)
+    number = rows * (length - FRAMES + 1)
+    torch.testing.assert_close(advice[number], expected[0], atol=1e-5, rtol=0)
 
 
 def test_a_copy_of_the_actor_learns_the_prior_actors_actions(store):

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LinearLR
 
-from wpt_agents.data.bars import shown
 from wpt_agents.data.trajectory import Batch
 from wpt_agents.model.actor_critic import Actor
 from wpt_agents.model.behavior_cloning import FRAMES, bc_loss
@@ -47,7 +46,6 @@ def imitate(
     steps: int,
     batch_size: int,
     streams: Streams,
-    progress_bar: bool = False,
 ) -> tuple[Actor, Tensor]:
     """Train a copy of the actor, so that an interruption leaves nothing half-learned.
 
@@ -65,7 +63,7 @@ def imitate(
     falling = LinearLR(optimizer, 1.0, 0.0, steps)
     rng = streams.numpy(Purpose.IMITATE, steps)
     loss = torch.zeros(())
-    for _ in shown(range(steps), steps, "imitate", progress_bar):
+    for _ in range(steps):
         chosen = torch.from_numpy(rng.integers(len(feats), size=batch_size)).to(feats.device)
         with learner.autocast():
             loss = bc_loss(actor.dist(feats[chosen], mask).mode, advice[chosen], mask)
